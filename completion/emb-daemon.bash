@@ -22,11 +22,11 @@ _emb_daemon() {
         fleet) options="" ;;
         effect) options="" ;;
         simulate) options="--corners --seconds --scenario --calibration --reference --mapping --keys --state --seed -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
-        monitor) options="--once --json --web --record --udp --mapping -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        monitor) options="--once --json --web --record --udp --share --mapping -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         files) options="" ;;
         compile) options="--output --target" ;;
         export) options="--calibration --output --kernels" ;;
-        uds) options="--config --state --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
+        uds) options="--config --state --share --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         xcp) options="--config --share --udp --can --request-id --response-id -i --interface -c --channel -b --bitrate --fd --bus-kwargs" ;;
         a2l) options="--config --output --udp --can --request-id --response-id -b --bitrate" ;;
         bench) options="--seconds --corners --json" ;;

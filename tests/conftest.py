@@ -41,7 +41,7 @@ from pathlib import Path
 from emb_daemon.ahead.build import build
 from emb_daemon.ahead.library import TARGETS, installed_digest
 from emb_daemon.jit import ENTRIES
-build(list(ENTRIES.values()), installed_digest(), TARGETS["aarch64"], Path(sys.argv[2]))
+build(list(ENTRIES.values()), installed_digest(), TARGETS["aarch64"], Path(sys.argv[2]), {})
 """
 
 

@@ -1,8 +1,10 @@
 """Kernels compiled ahead: the same bytes as from numba, without it; and nothing else is ever taken for them."""
 
 import argparse
+import base64
 import ctypes
 import grp
+import hashlib
 import os
 import platform
 import pwd
@@ -26,8 +28,10 @@ from emb_daemon.jit import ENTRIES
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.write import write_frames
 from emb_daemon.plant.scenarios import city_drive
+from emb_daemon.resources import resource
 from emb_daemon.runtime import bus, daemon
 from emb_daemon.wire.cmac import KEY, new_key
+from emb_daemon.wire.layout import CORNERS, LAYOUT, default_layout, load_layout
 
 _LIBM = {"exp", "log", "pow", "sin", "sincos"}
 _LIBC = {"memcpy", "memmove", "memset"}
@@ -73,24 +77,29 @@ def _symbols(path: Path) -> tuple[set[str], set[str]]:
 
 _ONE = """
 import sys
+from hashlib import sha256
 from pathlib import Path
 import emb_daemon.wire.cmac
 from emb_daemon.ahead.build import build
 from emb_daemon.ahead.library import TARGETS, installed_digest
 from emb_daemon.jit import ENTRIES
-build(list(ENTRIES.values()), installed_digest(), TARGETS[sys.argv[1]], Path(sys.argv[2]))
+from emb_daemon.resources import resource
+from emb_daemon.wire.layout import default_layout
+layouts = {sha256(resource("dbc/emb.dbc").read_bytes()).hexdigest(): default_layout().tobytes()}
+build(list(ENTRIES.values()), installed_digest(), TARGETS[sys.argv[1]], Path(sys.argv[2]), layouts)
 print(*ENTRIES)
 """
 _EXPAND = """
 import sys
-sys.modules["numba"] = None
+sys.modules |= dict.fromkeys(["numba", "cantools", "can"])
 from emb_daemon.ahead import library
 assert not library.load() and library.in_use()
 import numpy as np
+from emb_daemon.wire.layout import default_layout
 from emb_daemon.wire.cmac import KEY, new_key
 keys = np.zeros(1, KEY)
 new_key(bytes(range(16)), keys[0])
-print(keys.tobytes().hex())
+print(keys.tobytes().hex(), default_layout().tobytes().hex())
 """
 
 
@@ -102,7 +111,32 @@ def test_one_kernel_alone_gives_the_bytes_of_numba_and_needs_nothing(tmp_path):
     assert _symbols(path) == ({library.mark(installed_digest()), *done.stdout.split()}, set())
     done = processkit.python("-c", _EXPAND, EMB_DAEMON_KERNELS=str(path))
     new_key(bytes(range(16)), keys[0])
-    assert done.stdout == f"{keys.tobytes().hex()}\n", done.stderr
+    assert done.stdout == f"{keys.tobytes().hex()} {default_layout().tobytes().hex()}\n", done.stderr
+
+
+_DBC = resource("dbc/emb.dbc")
+_DBC_SHA256 = hashlib.sha256(_DBC.read_bytes()).hexdigest()
+
+
+def _holding(path: Path, monkeypatch, layouts: dict[str, bytes]) -> None:
+    """As if a library were in use that holds these."""
+    monkeypatch.setattr(library, "_manifest", read_manifest(_sealed(path, layouts=layouts)))
+
+
+@pytest.mark.parametrize("corners", [CORNERS, ("FL",), ("RR", "FR"), CORNERS[1:]])
+def test_the_layout_in_a_library_is_that_of_its_dbc(tmp_path, monkeypatch, corners):
+    whole, expected = load_layout(), load_layout(corners=corners)
+    _holding(tmp_path / "kernels.so", monkeypatch, {_DBC_SHA256: whole.tobytes()})
+    monkeypatch.setattr("emb_daemon.wire.layout.load_database", None)
+    assert load_layout(corners=corners).tobytes() == expected.tobytes()
+
+
+def test_a_layout_of_another_dbc_is_not_used(tmp_path, monkeypatch):
+    expected, other = load_layout().tobytes(), bytes(LAYOUT.itemsize)
+    _holding(tmp_path / "kernels.so", monkeypatch, {"of another": other})
+    assert load_layout().tobytes() == expected
+    _holding(tmp_path / "kernels.so", monkeypatch, {_DBC_SHA256: other})
+    assert load_layout().tobytes() == other and load_layout(_DBC).tobytes() == expected, "a DBC of one's own is read"
 
 
 def test_nothing_is_needed_beyond_libc_and_libm(compiled):
@@ -127,7 +161,7 @@ def test_the_daemon_says_which_code_it_runs(compiled, tmp_path):
 def _sealed(path: Path, **changes) -> Path:
     """A library that fits this machine but for ``changes``; no code is in it."""
     manifest = {"sources": installed_digest(), "machine": platform.machine(), "cpu": "a CPU", "flags": (), "made_by": "a test"}
-    path.write_bytes(seal(b"\x7fELF and more", **(manifest | changes)))
+    path.write_bytes(seal(b"\x7fELF and more", **({"layouts": {"a DBC": b"its layout"}} | manifest | changes)))
     path.chmod(0o644)
     return path
 
@@ -158,6 +192,7 @@ def test_one_that_does_not_fit_is_refused(tmp_path, changes, why):
         lambda whole: b"\x7fELF And more" + whole[13:],
         lambda whole: b"",
         lambda whole: whole.replace(b'"format":1', b'"format":2'),
+        lambda whole: whole.replace(base64.b64encode(b"its layout"), base64.b64encode(b"Its layout")),
     ],
 )
 def test_one_that_is_damaged_is_refused(tmp_path, damage):

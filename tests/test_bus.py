@@ -5,12 +5,13 @@ import os
 
 import can
 import numpy as np
+import processkit
 import pytest
 import wirekit
 
 from emb_daemon.calibration.configuration import Bus
 from emb_daemon.cli.options import add_bus_arguments, bus_options
-from emb_daemon.errors import Unavailable
+from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.bus import open_bus
 from emb_daemon.wire.frames import ERROR, FRAME
 
@@ -120,6 +121,26 @@ def _options(command_line: str, defaults=None) -> dict:
     parser = argparse.ArgumentParser()
     add_bus_arguments(parser)
     return bus_options(parser.parse_args(command_line.split()), defaults)
+
+
+def test_python_can_is_not_loaded_for_a_named_socketcan_bus():
+    """It would take a tenth of the daemon's start."""
+    code = (
+        "import argparse, sys; sys.modules['can'] = None; from emb_daemon.cli import options;"
+        "from emb_daemon.runtime.bus import open_bus; parser = argparse.ArgumentParser(); options.add_bus_arguments(parser);"
+        "arguments = parser.parse_args(['-i', 'socketcan', '-c', 'none0']);"
+        "open_bus(**options.bus_options(arguments), ids=[])"
+    )
+    done = processkit.python("-c", code, NUMBA_DISABLE_JIT="1")
+    assert done.stderr.splitlines()[-1].startswith("emb_daemon.errors.Unavailable: socketcan: "), done.stderr
+
+
+def test_python_can_fills_in_what_is_not_given(monkeypatch):
+    monkeypatch.setattr("emb_daemon.runtime.bus.open_socketcan", lambda channel, ids: channel)
+    monkeypatch.setenv("CAN_CHANNEL", "can7")
+    assert [open_bus("socketcan", channel, []) for channel in (None, "can3")] == ["can7", "can3"]
+    with pytest.raises(InputError, match="name one with --interface"):
+        open_bus("no_such", "can3", [])
 
 
 def test_command_line_before_environment_before_configuration(monkeypatch):

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import threading
 import time
+from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 import wirekit
 
 from emb_daemon.cli.main import main
+from emb_daemon.estimator.status import BEYOND_RANGE, DISC_UNEVEN, sentences
 from emb_daemon.monitor.listener import SECOND_NS, Listener
 from emb_daemon.monitor.metrics import exposition
 from emb_daemon.monitor.web import Datagrams, Web, hand_out
@@ -128,7 +130,7 @@ def test_a_taken_port_is_told(web, capsys):
 
 
 @contextlib.contextmanager
-def _live(receivers, channel, corners=CORNERS):
+def _live(receivers, channel, corners=CORNERS, shared=None):
     """A daemon's broadcasts on a bus inside the process, handed out."""
     bus, daemon, stop = open_bus("virtual", channel, Listener().ids), open_bus("virtual", channel, []), threading.Event()
 
@@ -143,7 +145,8 @@ def _live(receivers, channel, corners=CORNERS):
                 )
             counter += 1
 
-    threads = [threading.Thread(target=broadcast), threading.Thread(target=hand_out, args=(bus, receivers, stop.is_set))]
+    heard = (bus, receivers, stop.is_set, shared)
+    threads = [threading.Thread(target=broadcast), threading.Thread(target=hand_out, args=heard)]
     for thread in threads:
         thread.start()
     try:
@@ -186,6 +189,7 @@ def test_what_was_heard_is_recorded(tmp_path):
     recording, listener = Recording(tmp_path / "drive.mcap"), Listener()
     for counter in range(3):
         listener.hear(_broadcasts(100 * SECOND_NS, counter, 5.0 + counter, reasons=1))
+        listener.corners[0].facts = [None, [], ["the disc is uneven"]][counter]
         for _ in range(2):  # Nothing new the second time.
             recording.show(listener, 100 * SECOND_NS)
     recording.close()
@@ -195,17 +199,30 @@ def test_what_was_heard_is_recorded(tmp_path):
     schema, channel, message = rows[0]
     assert (channel.topic, channel.message_encoding, schema.encoding) == ("/FL", "json", "jsonschema")
     assert abs(message.log_time - time.time_ns()) < 60 * SECOND_NS
+    assert [json.loads(message.data)["facts"] for _, _, message in rows] == [None, [], ["the disc is uneven"]]
     described, said = json.loads(schema.data)["properties"], json.loads(message.data)
-    assert described.keys() == said.keys()
+    assert described.keys() == said.keys() and described["facts"]["type"] == ["array", "null"]
     kinds = {str: "string", float: "number", int: "number", type(None): "null", list: "array", dict: "object"}
     assert all(kinds[type(value)] in described[name]["type"] for name, value in said.items())
+
+
+def test_what_the_daemon_shares_is_followed(tmp_path, monkeypatch, capsys):
+    taken = []
+    monkeypatch.setattr("emb_daemon.monitor.web.hand_out", lambda *given: taken.append(given))
+    bus, path = ["-i", "virtual", "-c", "web-shared"], tmp_path / "estimates"
+    for share, record in (([], True), (["--share", str(path)], True), (["--share", str(path)], False)):
+        main(["monitor", *bus, *share, *(["--udp", "127.0.0.1:9"] if record else ["--once"])])
+    assert [given[3] and given[3]._reader.path for given in taken] == [None, path]
+    assert capsys.readouterr().err == "--share: expected together with --web, --record or --udp\n"
 
 
 @pytest.mark.skipif(not shutil.which("chromium"), reason="NOT RUN: no Chromium here (Debian: apt-get install chromium)")
 def test_the_page_draws_four_corners_in_a_browser(tmp_path):
     """Without script errors: words and plots stand there as a reader sees them."""
     server = Web(0, "virtual")
-    with _live([server], "web-browser"):
+    uneven, followed = {"facts": DISC_UNEVEN | BEYOND_RANGE}, []
+    shared = SimpleNamespace(follow=followed.append, of=lambda row: uneven if row == 1 else None)
+    with _live([server], "web-browser", shared=shared):
         time.sleep(2.0)
         browser = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1200,760", "--timeout=6000",
                    f"--user-data-dir={tmp_path}/profile", "--enable-logging=stderr"]  # fmt: skip
@@ -214,9 +231,13 @@ def test_the_page_draws_four_corners_in_a_browser(tmp_path):
             subprocess.run([*browser, what, page], capture_output=True, text=True, timeout=90)
             for what in ("--dump-dom", f"--screenshot={tmp_path}/page.png")
         )
+        said = json.loads(_get(server.port, "/state.json").read())["corners"]
     assert "CONSOLE" not in written.stderr + drawn.stderr, written.stderr
     assert re.findall("<h2>(..)</h2>", written.stdout) == list(CORNERS)
     assert "wheel speed lost" in written.stdout and "stiffness 0.912" in written.stdout
+    assert f"current lost: {sentences(DISC_UNEVEN | BEYOND_RANGE)}</div>" in written.stdout, "reasons, and why"
+    assert said["FL"]["facts"] is None and len(said["FR"]["facts"]) == 2, "nothing known is not nothing found"
+    assert abs(followed[-1] - time.monotonic_ns()) < 60 * SECOND_NS
     # The plots' line, at the right ends of all four.
     picture = matplotlib.image.imread(tmp_path / "page.png")[:, :, :3]
     line = np.abs(picture - np.array([0x0B, 0x5C, 0xAD]) / 255.0).max(axis=2) < 0.05

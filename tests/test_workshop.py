@@ -9,7 +9,9 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import processkit
 import pytest
@@ -18,13 +20,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import emb_daemon
+from emb_daemon.calibration.configuration import Setup
 from emb_daemon.calibration.files import calibration_hash
+from emb_daemon.cli import serving
 from emb_daemon.cli.main import main
 from emb_daemon.errors import Unavailable
+from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
+from emb_daemon.estimator.status import TABLE, names
 from emb_daemon.monitor.listener import Listener
+from emb_daemon.plant.car import Car
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.live import LiveCar
+from emb_daemon.plant.scenarios import rest, stop
+from emb_daemon.runtime import shared
 from emb_daemon.runtime.bus import open_bus
+from emb_daemon.runtime.daemon import Daemon
+from emb_daemon.runtime.shared import EstimatesReader, PresentEstimates, SharedEstimates
 from emb_daemon.wire.contract import CURRENT_LOST, DEGRADED, INIT, REASONS, RESOLVER_LOST, RUNNING
-from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CORNERS, ESTIMATOR_STATUS
 from emb_daemon.workshop import trouble
 from emb_daemon.workshop.trouble import CONFIRMED, FAILED_THIS_CYCLE, PENDING, TEST_FAILED, Frame, TroubleMemory, code_of
@@ -35,6 +47,9 @@ _CONFIGURATION = _ROOT / "config" / "emb.yaml"
 _FRAME = Frame(1_700_000_000, DEGRADED, 1, 12_345.0, 67.0, (301.2, 250.0, 290.0, None), -73.1, 0.912)
 _GROUP = f"239.74.164.{os.getpid() % 250 + 3}"
 FL, RR = 0, 3
+#: Of `Frame`, what only a daemon that shares its estimates tells, and that on the wire where it is not to be used.
+_SHARED = ("stiffness_force_N", "stiffness_sigma_N", "torque_force_N", "torque_sigma_N", "facts")
+_NOT_SHARED = [0xFFFF] * 4 + [0xFFFFFFFF]
 
 
 def _judge(memory, reasons, times=3, corner=FL, mode=DEGRADED, frame=_FRAME, now_s=0.0):
@@ -85,6 +100,18 @@ def test_a_cycle_in_which_nothing_was_judged_does_not_count(tmp_path):
     assert entry.aged == 0 and entry.status & CONFIRMED and entry.status & PENDING
 
 
+def test_a_file_of_a_version_without_shared_values_is_read(tmp_path):
+    _judge(TroubleMemory(tmp_path), CURRENT_LOST)
+    path = tmp_path / trouble.FILE
+    content = msgspec.json.decode(path.read_bytes())["content"]
+    for entry in content["entries"].values():
+        for name in _SHARED if entry["frame"] else ():
+            assert entry["frame"].pop(name) is None
+    trouble.files.write(path, content)
+    memory = TroubleMemory(tmp_path)
+    assert not memory.warning and memory.entries[code_of(FL, 1)].frame == _FRAME
+
+
 def test_a_damaged_file_is_set_aside_and_told(tmp_path):
     _judge(TroubleMemory(tmp_path), CURRENT_LOST)
     path = tmp_path / trouble.FILE
@@ -127,14 +154,81 @@ def test_status_bits_never_contradict_each_other(tmp_path_factory, steps):
 )
 def test_no_value_is_taken_for_one_that_is_not_to_be_used(value, unsigned, signed):
     factor = value and 1e-4 * value
-    frame = Frame(1, DEGRADED, 2, value, value, (value,) * 4, value, factor).encode()
-    assert frame.hex() == f"00000001{DEGRADED:02x}02" + 2 * unsigned + 5 * signed + unsigned
+    facts = None if value is None else ("zero_wanders", "not_a_number")
+    frame = Frame(1, DEGRADED, 2, value, value, (value,) * 4, value, factor, value, value, value, value, facts).encode()
+    bits = "ffffffff" if value is None else "02000002"
+    assert frame.hex() == f"00000001{DEGRADED:02x}02" + 2 * unsigned + 5 * signed + 5 * unsigned + bits
 
 
 def test_every_reason_of_every_corner_has_a_code_of_its_own():
     codes = {code_of(corner, reason) for corner in range(len(CORNERS)) for reason in range(len(REASONS))}
     assert len(codes) == trouble.CODES
     assert code_of(2, 5) == 0x520500
+
+
+# --- What is shared -----------------------------------------------------------------------------------------------------
+
+
+def _row(corner=FL, time_ns=0, **values) -> np.ndarray:
+    row = np.zeros(1, ESTIMATE)
+    row["corner"], row["time_ns"], row["is_sample"] = corner, time_ns, True
+    for name, value in values.items():
+        row[name] = value
+    return row
+
+
+class _Sharing:
+    """A daemon's side and a reader's, by a clock that stands until told otherwise."""
+
+    def __init__(self, path: Path):
+        self.pipeline = SimpleNamespace(
+            samples=np.zeros(4, SAMPLE), estimates=np.zeros(4, ESTIMATE), parameters=np.zeros(4, PARAMETERS)
+        )
+        self.now_ns, self.present, self._loop = 0, PresentEstimates(path), SharedEstimates(path, self.pipeline)
+        self.present.follow(0)
+
+    def tell(self, row: np.ndarray) -> None:
+        self.pipeline.estimates[:1] = row
+        self._loop.write(1)
+        self.pass_ms(0)
+
+    def pass_ms(self, ms: int) -> None:
+        self.now_ns += ms * wirekit.MS
+        for _ in range(2):
+            self.present.follow(self.now_ns)
+
+
+def test_of_each_corner_the_newest_sample_is_told_while_it_is_of_the_present(tmp_path):
+    sharing = _Sharing(tmp_path / "estimates")
+    for row in (_row(torque_force=1.0), _row(RR, torque_force=2.0), _row(torque_force=3.0), _row(is_sample=False)):
+        sharing.tell(row)
+    assert [sharing.present.of(corner)["torque_force"] for corner in (FL, RR)] == [3.0, 2.0]
+    assert sharing.present.of(1) is None
+    sharing.pass_ms(200)
+    sharing.tell(_row(RR, 200 * wirekit.MS))
+    assert sharing.present.of(FL) is not None and not sharing.present.trouble
+    sharing.pass_ms(200)
+    assert sharing.present.of(FL) is None and sharing.present.of(RR) is not None, "FL's daemon is silent"
+    for _ in range(20):
+        sharing.pass_ms(10)
+    assert sharing.present.of(RR) is None and sharing.present.trouble.endswith("no daemon shares its estimates there")
+    sharing.tell(_row(RR, 600 * wirekit.MS))
+    assert sharing.present.of(RR) is not None and not sharing.present.trouble
+
+
+@pytest.mark.parametrize("content, said", [
+    (None, "no daemon shares its estimates there"),
+    (bytes(shared.SHARED.itemsize), "written by another version of the daemon"),
+])  # fmt: skip
+def test_why_nothing_is_shared_is_told_when_it_lasts(tmp_path, content, said):
+    path = tmp_path / "estimates"
+    if content:
+        path.write_bytes(content)
+    present = PresentEstimates(path)
+    for expected in ["", "", "", *[None] * 50, f"{path}: {said}"]:
+        present.follow(0)
+        assert expected is None or present.trouble == expected
+        assert present.of(FL) is None
 
 
 # --- Requests -----------------------------------------------------------------------------------------------------------
@@ -172,7 +266,7 @@ class _Served:
 
         self.bus = open_bus("virtual", channel, [*Listener().ids, 0x710])
         self.daemon = open_bus("virtual", channel, [])
-        self.diagnostics = Diagnostics(self.bus, _CONFIGURATION, state, 0x710, 0x718)
+        self.diagnostics = Diagnostics(self.bus, _CONFIGURATION, state, 0x710, 0x718, state / "estimates")
         self._stop, self._counter = threading.Event(), 0
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -181,19 +275,20 @@ class _Served:
         while not self._stop.is_set():
             self.diagnostics.step()
 
-    def broadcast(self, reasons: int, times: int = 3) -> None:
+    def broadcast(self, reasons: int, times: int = 3, corner: str = "FL") -> None:
         """Each is heard before the next comes: of what comes at once, the server takes the newest."""
-        status = self.diagnostics.listener.corners[FL].streams[ESTIMATOR_STATUS]
+        status = self.diagnostics.listener.corners[CORNERS.index(corner)].streams[ESTIMATOR_STATUS]
         for _ in range(times):
             heard, deadline = status.received, time.monotonic() + 30.0
             now, counter = time.monotonic_ns(), self._counter % 15
             self._counter += 1
             self.daemon.send(np.concatenate([
-                wirekit.frame("EMB_FL_ClampForce", now, counter, 1, ClampForce=12.345, ClampForceSigma=0.067, ForceSource=1),
-                wirekit.frame("EMB_FL_PadTemp", now, counter, 0, InnerSurfaceTemp=301.25, InnerMeanTemp=250.0,
+                wirekit.frame(f"EMB_{corner}_ClampForce", now, counter, 1, ClampForce=12.345, ClampForceSigma=0.067,
+                              ForceSource=1),
+                wirekit.frame(f"EMB_{corner}_PadTemp", now, counter, 0, InnerSurfaceTemp=301.25, InnerMeanTemp=250.0,
                               OuterSurfaceTemp=290.0, OuterMeanTemp=240.0),
-                wirekit.frame("EMB_FL_EstimatorStatus", now, counter, 1, Mode=3, StiffnessFactor=0.912, ContactAngle=-73.1,
-                              DegradedReasons=reasons),
+                wirekit.frame(f"EMB_{corner}_EstimatorStatus", now, counter, 1, Mode=3, StiffnessFactor=0.912,
+                              ContactAngle=-73.1, DegradedReasons=reasons),
             ]))  # fmt: skip
             while status.received == heard:
                 assert time.monotonic() < deadline, "a broadcast was not heard"
@@ -206,7 +301,7 @@ class _Served:
 
 
 @contextlib.contextmanager
-def _tester(channel: str):
+def _tester(channel: str, interface: str = "virtual"):
     """udsoncan's client over can-isotp, neither of them ours."""
     import can
     import isotp
@@ -231,11 +326,12 @@ def _tester(channel: str):
         def __len__(self):
             raise DidCodec.ReadAllRemainingData
 
-    with can.Bus(interface="virtual", channel=channel) as bus:
+    with can.Bus(interface=interface, channel=channel) as bus:
         address = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x710, rxid=0x718)
         stack = isotp.CanStack(bus, address=address, params={"tx_padding": 0})
         size = struct.calcsize(Frame.LAYOUT)
-        identifiers = {0xF189: Rest(0), 0x1000: AsciiCodec(12), 0x1010: Rest(0), 0x1100: Bytes(size)}
+        texts = dict.fromkeys((0xF189, 0x1010, 0x1120, 0x1122), Rest(0))
+        identifiers = texts | {0x1000: AsciiCodec(12), 0x1100: Bytes(size)}
         # No timed test: what the server promises is for a machine that is not busy with others.
         config = {"data_identifiers": identifiers, "use_server_timing": False, "request_timeout": 10, "p2_timeout": 10}
         with Client(PythonIsoTpConnection(stack), config=config) as client:
@@ -268,7 +364,7 @@ def test_a_tester_reads_and_clears_trouble_codes(served, tmp_path):
     [dtc] = client.get_dtc_snapshot_by_dtc_number(code_of(FL, 0), record_number=1).service_data.dtcs
     stamp, *values = struct.unpack(Frame.LAYOUT, dtc.snapshots[0].data)
     assert abs(stamp - time.time()) < 60
-    assert values == [3, 1, 12345, 67, 3012, 2500, 2900, 2400, -731, 9120]
+    assert values == [3, 1, 12345, 67, 3012, 2500, 2900, 2400, -731, 9120, *_NOT_SHARED]
     [dtc] = client.get_dtc_extended_data_by_dtc_number(code_of(FL, 0), record_number=1, data_size=2).service_data.dtcs
     assert list(dtc.extended_data[0].raw_data) == [1, 0]
 
@@ -287,6 +383,24 @@ def test_a_tester_reads_versions_calibration_and_estimates(served):
     assert client.read_data_by_identifier(0x1010).service_data.values[0x1010] == b"{}"
     server.broadcast(0, times=1)
     assert struct.unpack(Frame.LAYOUT, client.read_data_by_identifier(0x1100).service_data.values[0x1100])[3] == 12345
+    assert client.read_data_by_identifier(0x1120).service_data.values[0x1120] == b"not known"
+
+
+def test_what_a_daemon_shares_goes_to_the_corner_that_it_is_of(served, tmp_path):
+    server, client = served
+    found, later = TABLE["zero_wanders"].sentence + "; " + TABLE["beyond_range"].sentence, time.monotonic_ns() + 10**12
+    facts = sum(1 << bit for bit, name in enumerate(TABLE) if name in ("zero_wanders", "beyond_range"))
+    forces = {"stiffness_force": 12000.4, "stiffness_sigma": 70.0, "torque_force": np.nan, "torque_sigma": np.inf}
+    rows = np.concatenate([_row(FL, later, torque_force=1.0), _row(2, later, facts=facts, **forces)])
+    loop = SharedEstimates(tmp_path / "estimates", SimpleNamespace(
+        samples=np.zeros(2, SAMPLE), estimates=rows, parameters=np.zeros(4, PARAMETERS)))  # fmt: skip
+    deadline = time.monotonic() + 30.0
+    while client.read_data_by_identifier(0x1122).service_data.values[0x1122] != found.encode():
+        assert time.monotonic() < deadline, "the facts are not told"
+        loop.write(2)
+    server.broadcast(RESOLVER_LOST, corner="RL")
+    [dtc] = client.get_dtc_snapshot_by_dtc_number(code_of(2, 0), record_number=1).service_data.dtcs
+    assert struct.unpack(Frame.LAYOUT, dtc.snapshots[0].data)[-5:] == (12000, 70, 0xFFFF, 0xFFFF, facts)
 
 
 def test_codes_that_cannot_be_kept_are_told_all_the_same(served, monkeypatch):
@@ -318,37 +432,100 @@ def test_what_is_not_there_is_refused(served):
         assert refused.value.response.code == code
 
 
-def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path):
+class _Losing:
+    """A bus that loses what FL's thermocouples send once its brake is clamped."""
+
+    def __init__(self, bus):
+        self._bus, self._lost = bus, -1
+
+    def __getattr__(self, name):
+        return getattr(self._bus, name)
+
+    def send(self, frames: np.ndarray) -> None:
+        self._bus.send(frames[frames["can_id"] != self._lost])
+
+    def follow(self, _, truth: np.ndarray) -> None:
+        if truth["force"][0] > 3000.0:
+            self._lost = wirekit.database().get_message_by_name("EMB_FL_Thermocouple").frame_id
+
+
+@contextlib.contextmanager
+def _driven(calibration, estimates: Path):
+    """A daemon that shares its estimates, and a car that brakes, each on the group's bus."""
+    setup = Setup(_CONFIGURATION)
+    ids = np.flatnonzero(setup.layout["slot"][0] != -1).tolist()
+    daemon = Daemon(setup, open_bus("udp_multicast", _GROUP, ids))
+    daemon.share(estimates)
+    bus, plant = _Losing(open_bus("udp_multicast", _GROUP, [])), np.array([plant_from_calibration(calibration, 0)])
+    car = LiveCar(Car(plant, ("FL",)), bus, rest(1.0) + stop(6000.0, 60.0))
+    daemon.warm_up(), car.warm_up()
+    ended = threading.Event()
+    threads = [threading.Thread(target=daemon.run), threading.Thread(target=car.run, args=(ended.is_set, None, bus.follow))]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        ended.set(), daemon.stop()
+        for thread in threads:
+            thread.join()
+        daemon._bus.close(), bus.close()
+
+
+def _told(row) -> tuple:
+    """Of an ESTIMATE, what `_SHARED` names."""
+    forces = (row["stiffness_force"], row["stiffness_sigma"], row["torque_force"], row["torque_sigma"])
+    return *(float(value) if np.isfinite(value) else None for value in forces), names(int(row["facts"]))
+
+
+def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path, calibration):
+    """A tester gets both paths' forces, which are on no bus, as the daemon's ESTIMATE has them at a failure."""
+    pytest.importorskip("udsoncan", reason="NOT RUN: udsoncan is not installed")
     pytest.importorskip("isotp", reason="NOT RUN: can-isotp is not installed")
     try:
-        daemon = open_bus("udp_multicast", _GROUP, [0x718])
+        open_bus("udp_multicast", _GROUP, []).close()
     except Unavailable as error:
         pytest.skip(f"NOT RUN: no multicast here ({error})")
+    estimates, code = tmp_path / "estimates", code_of(FL, REASONS.index("thermocouple lost"))
     command = [sys.executable, "-m", "emb_daemon.cli.main", "uds", "--config", _CONFIGURATION, "--state", tmp_path]
-    process = subprocess.Popen([*command, "-i", "udp_multicast", "-c", _GROUP], stdout=subprocess.PIPE, text=True,
-                               env=processkit.environment(NUMBA_DISABLE_JIT="1"))  # fmt: skip
+    process = subprocess.Popen([*command, "--share", estimates, "-i", "udp_multicast", "-c", _GROUP], text=True,
+                               stdout=subprocess.PIPE, env=processkit.environment(NUMBA_DISABLE_JIT="1"))  # fmt: skip
+    told, reader = set(), EstimatesReader(estimates)
     try:
         assert "requests 0x710, responses 0x718" in process.stdout.readline()
-        request = np.zeros(1, FRAME)
-        request["can_id"], request["length"], request["data"] = 0x710, 8, 0x3E02
-        # Until the code is kept: of what comes at once, the server takes the newest.
-        deadline, counter = time.monotonic() + 30.0, 0
-        while b'"occurrences": 1' not in (tmp_path / trouble.FILE).read_bytes():
-            assert time.monotonic() < deadline, "no trouble code was kept"
-            daemon.send(wirekit.frame("EMB_RR_EstimatorStatus", time.monotonic_ns(), counter, 1, Mode=3, DegradedReasons=1))
-            counter = (counter + 1) % 15
-            time.sleep(0.1)
-        daemon.send(request)
-        while not len(heard := daemon.drain()):
-            assert time.monotonic() < deadline, "no answer to tester present"
-            daemon.wait(1.0)
-        assert int(heard["data"][0]) & 0xFFFFFF == 0x007E02
+        with _driven(calibration, estimates), _tester(_GROUP, "udp_multicast") as client:
+            deadline = time.monotonic() + 60.0
+            while not (found := client.get_dtc_snapshot_by_dtc_number(code, record_number=1).service_data.dtcs[0].snapshots):
+                assert time.monotonic() < deadline, "no freeze frame"
+                reader.look()
+                told |= {_told(row) for row in reader.take()[1] if row["corner"] == FL}
+            for _ in range(2):
+                told |= {_told(row) for row in reader.take()[1] if row["corner"] == FL}
     finally:
         process.kill()
         process.wait()
-        daemon.close()
-    entry = TroubleMemory(tmp_path).entries[code_of(RR, 0)]
-    assert entry.status & CONFIRMED and entry.frame.mode == DEGRADED
+    entry = TroubleMemory(tmp_path).entries[code]
+    assert entry.status & CONFIRMED and entry.frame.encode() == found[0].data
+    kept = tuple(getattr(entry.frame, name) for name in _SHARED)
+    assert kept in told and None not in kept and kept[0] != kept[2]
+    *forces, facts = struct.unpack(Frame.LAYOUT, found[0].data)[-5:]
+    assert forces == [round(value) for value in kept[:4]]
+    assert tuple(name for bit, name in enumerate(TABLE) if facts >> bit & 1) == kept[4]
+
+
+def test_a_trouble_is_said_once(monkeypatch, capsys):
+    stopped, troubles = [], ["", "full", "full", "", "", "full"]
+
+    class Troubled:
+        trouble = ""
+
+        def step(self):
+            self.trouble = troubles.pop(0)
+            stopped.extend([True] * (not troubles))
+
+    monkeypatch.setattr(serving, "stop_signals", lambda: stopped)
+    serving.serve(Troubled(), "at work")
+    assert capsys.readouterr() == ("at work\n", "full\nfull\n")
 
 
 def test_an_id_that_the_daemon_sends_is_refused(capsys):

@@ -151,6 +151,17 @@ def test_the_daemon_tells_the_estimates_that_it_sends(tmp_path):
     here.close(), there.close()
 
 
+def test_a_daemon_that_cannot_share_runs_all_the_same(tmp_path, caplog):
+    here, there = socket_pair()
+    daemon = Daemon(Setup(_CONFIGURATION), here)
+    daemon.share(tmp_path / "none" / "estimates")
+    assert "estimates are not shared" in caplog.text and "No such file" in caplog.text
+    daemon.pipeline.begin(0)
+    daemon.tick(100_000_000, Pacer(0))
+    assert len(there.drain())
+    here.close(), there.close()
+
+
 # --- Packets ------------------------------------------------------------------------------------------------------------
 
 

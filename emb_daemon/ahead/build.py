@@ -169,8 +169,9 @@ def _link(elf: bytes, command: list[str]) -> bytes:
         return library.read_bytes()
 
 
-def build(entries: list[Entry], sources: str, target: Target, path: Path) -> None:
-    """Write the library of ``entries`` that were imported from ``sources`` (`library.source_digest`).
+def build(entries: list[Entry], sources: str, target: Target, path: Path, layouts: dict[str, bytes]) -> None:
+    """Write the library of ``entries`` that were imported from ``sources`` (`library.source_digest`), with ``layouts`` as in
+    `library.Manifest`.
 
     With the ending ``.o`` it is a plain object, to be linked into a program.
 
@@ -185,6 +186,7 @@ def build(entries: list[Entry], sources: str, target: Target, path: Path) -> Non
         return write_atomically(path, elf)
     content = seal(
         _link(elf, linker),
+        layouts,
         sources=sources,
         machine=target.machine,
         cpu=target.cpu,

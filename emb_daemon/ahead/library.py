@@ -61,7 +61,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Description of a library, stored in it."""
 
     format: int = _FORMAT
-    #: Of the ELF object before this line.
+    #: Of the ELF object before this line, followed by the layouts.
     sha256: str
     #: `source_digest` of what it was made from.
     sources: str
@@ -71,6 +71,8 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     flags: tuple[str, ...]
     #: Versions of emb_daemon, numba and llvmlite that made it.
     made_by: str
+    #: LAYOUT with all corners (`wire.layout`) of DBCs, by their SHA-256.
+    layouts: dict[str, bytes]
 
 
 class Refused(Exception):
@@ -136,9 +138,13 @@ def find() -> Path | None:
     return path if named or path.exists() else None
 
 
-def seal(elf: bytes, **manifest: str | tuple[str, ...]) -> bytes:
+def seal(elf: bytes, layouts: dict[str, bytes], **manifest: str | tuple[str, ...]) -> bytes:
     """A library's bytes."""
-    return elf + b"\n" + msgspec.json.encode(Manifest(sha256=hashlib.sha256(elf).hexdigest(), **manifest))
+    return elf + b"\n" + msgspec.json.encode(Manifest(sha256=_sha256(elf, layouts), layouts=layouts, **manifest))
+
+
+def _sha256(elf: bytes, layouts: dict[str, bytes]) -> str:
+    return hashlib.sha256(b"".join([elf, *layouts.values()])).hexdigest()
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -148,7 +154,7 @@ def read_manifest(path: Path) -> Manifest:
         manifest = msgspec.json.decode(line, type=Manifest)
     except msgspec.DecodeError:
         raise Refused("it is incomplete, or was not made by emb-daemon compile") from None
-    if manifest.format != _FORMAT or hashlib.sha256(elf).hexdigest() != manifest.sha256:
+    if manifest.format != _FORMAT or _sha256(elf, manifest.layouts) != manifest.sha256:
         raise Refused("its content is damaged")
     return manifest
 
@@ -176,6 +182,7 @@ def check(path: Path) -> Manifest:
 
 
 _loaded: ctypes.CDLL | None = None
+_manifest: Manifest | None = None
 _says = "kernels are compiled by numba"
 
 
@@ -188,7 +195,7 @@ def load() -> str:
     Raises:
         InputError: numba is not installed either.
     """
-    global _loaded, _says
+    global _loaded, _manifest, _says
     path, why = find(), ""
     if path:
         try:
@@ -197,7 +204,7 @@ def load() -> str:
             manifest = check(path)
             # Symbols of libm that a linker left undefined are resolved from the libraries already loaded.
             ctypes.CDLL("libm.so.6", mode=ctypes.RTLD_GLOBAL)
-            _loaded = ctypes.CDLL(str(path), mode=os.RTLD_NOW)
+            _loaded, _manifest = ctypes.CDLL(str(path), mode=os.RTLD_NOW), manifest
             _says = f"kernels of {path}, compiled ahead for {manifest.cpu} by {manifest.made_by}"
         except (Refused, OSError) as refusal:
             why = f"kernels of {path} are not used: {getattr(refusal, 'strerror', None) or refusal}"
@@ -215,6 +222,11 @@ def description() -> str:
 def in_use() -> bool:
     """Whether this process runs the kernels of a library."""
     return _loaded is not None
+
+
+def layout_of(dbc: Path) -> bytes:
+    """The LAYOUT that the library in use holds for a DBC; empty if it holds none."""
+    return _manifest.layouts.get(hashlib.sha256(dbc.read_bytes()).hexdigest(), b"") if _manifest else b""
 
 
 class _Words(threading.local):

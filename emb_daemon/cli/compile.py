@@ -1,6 +1,7 @@
 """emb-daemon compile."""
 
 import argparse
+import hashlib
 import os
 import platform
 import tempfile
@@ -8,6 +9,7 @@ import tempfile
 from emb_daemon.ahead.library import TARGETS, default_path, installed_digest
 from emb_daemon.cli.options import add_path
 from emb_daemon.errors import InputError
+from emb_daemon.resources import resource
 
 EXAMPLE = "emb-daemon compile --target aarch64 --output kernels-aarch64.so"
 
@@ -33,8 +35,10 @@ def run(arguments: argparse.Namespace) -> int:
         from emb_daemon.ahead.build import build
         from emb_daemon.jit import ENTRIES
         from emb_daemon.runtime import bus, daemon
+        from emb_daemon.wire.layout import default_layout
 
         assert bus and daemon, "imported for their entry points"
-        build(list(ENTRIES.values()), sources, TARGETS[machine], arguments.output)
+        layouts = {hashlib.sha256(resource("dbc/emb.dbc").read_bytes()).hexdigest(): default_layout().tobytes()}
+        build(list(ENTRIES.values()), sources, TARGETS[machine], arguments.output, layouts)
     print(f"{arguments.output}: kernels for {machine} ({TARGETS[machine].cpu})")
     return 0

@@ -25,6 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--web", nargs="?", type=int, const=_PORT, metavar="PORT", help=page)
     add_path(parser, "--record", "record everything received into an MCAP file")
     parser.add_argument("--udp", metavar="HOST:PORT", help="send JSON datagrams, 50 a second, for PlotJuggler")
+    text = "the file given to emb-daemon run as --share; --web, --record and --udp then say what the estimator finds, too"
+    add_path(parser, "--share", text)
     add_mapping_argument(parser)
     add_bus_arguments(parser)
 
@@ -62,6 +64,8 @@ def _check(arguments: argparse.Namespace, handed_out: bool) -> None:
         raise InputError("--json: expected together with --once")
     if handed_out and arguments.once:
         raise InputError("--once: expected without --web, --record and --udp")
+    if arguments.share and not handed_out:
+        raise InputError("--share: expected together with --web, --record or --udp")
     if arguments.web is not None and not 0 <= arguments.web <= 0xFFFF:
         raise InputError(f"--web {arguments.web}: expected a port, 0 to 65535; 0 is any that is free")
     if not arguments.once and not handed_out and not sys.stdout.isatty():
@@ -85,6 +89,7 @@ def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
     """Serve browsers, Prometheus and PlotJuggler, and record, until the user ends it."""
     from emb_daemon.monitor.recording import Recording
     from emb_daemon.monitor.web import Datagrams, Web, hand_out
+    from emb_daemon.runtime.shared import PresentEstimates
 
     receivers, stopped = [], stop_signals()
     if arguments.udp is not None:
@@ -96,7 +101,7 @@ def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:
         check_output(arguments.record, [], (".mcap",))
         receivers.append(Recording(arguments.record))
     try:
-        hand_out(bus, receivers, lambda: bool(stopped))
+        hand_out(bus, receivers, lambda: bool(stopped), PresentEstimates(arguments.share) if arguments.share else None)
     finally:
         for receiver in receivers:
             receiver.close()

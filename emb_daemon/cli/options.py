@@ -24,6 +24,13 @@ def add_path(parser: argparse._ActionsContainer, name: str, help: str, metavar: 
     parser.add_argument(name, type=Path, metavar=metavar, help=help, **options)
 
 
+def add_share_argument(parser: argparse.ArgumentParser) -> None:
+    """--share of a process that reads what the daemon shares."""
+    default = "/run/emb_daemon/estimates"
+    text = f"the file given to emb-daemon run as --share (default: {default}, the service's)"
+    add_path(parser, "--share", text, default=Path(default))
+
+
 def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, ...] = ()) -> None:
     """Refuse a path that cannot be written, that is not a regular file, or that is an input.
 
@@ -124,9 +131,11 @@ def check_ids(arguments: argparse.Namespace, taken: Collection[int]) -> None:
 def bus_options(arguments: argparse.Namespace, defaults: "Bus | None" = None) -> dict[str, Any]:
     """Keyword arguments for `runtime.bus.open_bus`: the command line, else CAN_* variables, else ``defaults``, a
     configuration's Bus."""
-    from can.util import load_environment_config
+    environment, options = {}, {}
+    if any(name.startswith("CAN_") for name in os.environ):
+        from can.util import load_environment_config
 
-    environment, options = load_environment_config(), {}
+        environment = load_environment_config()
     for name in ("interface", "channel", "bitrate"):
         options[name] = getattr(arguments, name) or environment.get(name) or getattr(defaults, name, None)
     if arguments.fd:

@@ -14,9 +14,7 @@ EXAMPLE = "emb-daemon run --config /etc/emb_daemon/emb.yaml -i socketcan -c can0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_path(parser, "--config", "configuration, such as config/emb.yaml", required=True)
     add_mapping_argument(parser)
-    add_path(
-        parser, "--share", "share the estimates of every tick in FILE, which must be in a folder kept in memory; xcp reads it"
-    )
+    add_path(parser, "--share", "share the estimates of every tick in FILE, in a folder kept in memory; uds and xcp read it")
     add_bus_arguments(parser)
 
 

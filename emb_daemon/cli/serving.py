@@ -29,4 +29,5 @@ def serve(server: Server, greeting: str) -> None:
         server.step()
         if server.trouble != told:
             told = server.trouble
-            print(told, file=sys.stderr, flush=True)
+            if told:
+                print(told, file=sys.stderr, flush=True)

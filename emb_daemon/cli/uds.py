@@ -3,7 +3,15 @@
 import argparse
 import sys
 
-from emb_daemon.cli.options import CONFIG_HELP, add_bus_arguments, add_id_arguments, add_path, bus_options, check_ids
+from emb_daemon.cli.options import (
+    CONFIG_HELP,
+    add_bus_arguments,
+    add_id_arguments,
+    add_path,
+    add_share_argument,
+    bus_options,
+    check_ids,
+)
 from emb_daemon.cli.serving import serve
 from emb_daemon.errors import InputError
 
@@ -15,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     default = "$STATE_DIRECTORY, the configuration's, or /var/lib/emb_daemon"
     state = f"the daemon's state directory; trouble codes are stored there too (default: {default})"
     add_path(parser, "--state", state, "DIR")
+    add_share_argument(parser)
     add_id_arguments(parser, 0x710, 0x718)
     add_bus_arguments(parser)
 
@@ -34,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"{state}: no such state directory; give it with --state")
     bus = open_bus(**bus_options(arguments, configuration.bus), ids=[*listened, arguments.request_id])
     try:
-        diagnostics = Diagnostics(bus, arguments.config, state, arguments.request_id, arguments.response_id)
+        diagnostics = Diagnostics(bus, arguments.config, state, arguments.request_id, arguments.response_id, arguments.share)
         if diagnostics.memory.warning:
             print(diagnostics.memory.warning, file=sys.stderr)
         serve(

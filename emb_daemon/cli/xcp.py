@@ -7,6 +7,7 @@ from emb_daemon.cli.options import (
     add_bus_arguments,
     add_id_arguments,
     add_path,
+    add_share_argument,
     bus_options,
     check_ids,
     host_and_port,
@@ -14,14 +15,14 @@ from emb_daemon.cli.options import (
 from emb_daemon.cli.serving import serve
 
 EXAMPLE = (
-    "emb-daemon xcp --config /etc/emb_daemon/emb.yaml --share /run/emb_daemon/estimates --udp 127.0.0.1:5555\n"
-    "  emb-daemon xcp --config /etc/emb_daemon/emb.yaml --share /run/emb_daemon/estimates --can -c can0"
+    "emb-daemon xcp --config /etc/emb_daemon/emb.yaml --udp 127.0.0.1:5555\n"
+    "  emb-daemon xcp --config /etc/emb_daemon/emb.yaml --can -c can0"
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_path(parser, "--config", CONFIG_HELP, required=True)
-    add_path(parser, "--share", "the file given to emb-daemon run as --share", required=True)
+    add_share_argument(parser)
     transport = parser.add_mutually_exclusive_group(required=True)
     transport.add_argument(
         "--udp",

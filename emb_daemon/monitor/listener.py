@@ -85,6 +85,8 @@ class Corner:
         #: [second, largest usable force in kN, number of forces], the newest last.
         self._seconds: deque[list] = deque(maxlen=HISTORY_S + 1)
         self._reference_kN, self._reference_ns = math.nan, 0
+        #: What the estimator finds, in words, which is not on the bus; None: not known.
+        self.facts: list[str] | None = None
 
     def remember(self, force_kN: float, time_ns: int) -> None:
         second = time_ns // SECOND_NS
@@ -154,6 +156,7 @@ class Corner:
             "input_age_ms": int(force.values[4]) if force.values else None,
             "mode": _word(contract.MODES, status, 0),
             "reasons": list(self.reasons()),
+            "facts": self.facts,
             "stiffness_factor": value(status, 1, 4),
             "contact_angle_rad": value(status, 2, 1),
             "inner_surface_C": value(heat, 0, 2),

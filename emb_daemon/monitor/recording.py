@@ -15,7 +15,7 @@ def _schema(value) -> dict:
     if isinstance(value, dict):
         return {"type": "object", "properties": {name: _schema(inner) for name, inner in value.items()}}
     if isinstance(value, list):
-        return {"type": "array", "items": {"type": "string"}}
+        return {"type": ["array", "null"], "items": {"type": "string"}}
     return {"type": ["string", "null"] if isinstance(value, str) else ["number", "null"]}
 
 
@@ -44,7 +44,7 @@ class Recording:
     def _channel(self, corner: Corner, state: dict) -> int:
         if corner.name not in self._channels:
             words = {name: value or "" for name, value in state.items() if name in ("status", "source", "mode")}
-            words["adaptation"] = {"request": "", "progress_percent": 0, "result": ""}
+            words |= {"facts": [], "adaptation": {"request": "", "progress_percent": 0, "result": ""}}
             schema = self._writer.register_schema(
                 "emb_daemon.Corner", "jsonschema", json.dumps(_schema(state | words)).encode()
             )

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from emb_daemon.errors import Unavailable
+from emb_daemon.estimator.status import TABLE, names
 from emb_daemon.monitor.listener import HISTORY_S, Listener
 from emb_daemon.monitor.metrics import exposition
 from emb_daemon.runtime.bus import Bus
+from emb_daemon.runtime.shared import PresentEstimates
 
 #: Period of taking frames and sending datagrams, s; period for browsers, which draw a minute on some hundred pixels, s.
 _HEAR_S, _SHOW_S = 0.02, 0.1
@@ -153,8 +155,10 @@ class Receiver(Protocol):
     def show(self, listener: Listener, now_ns: int) -> None: ...
 
 
-def hand_out(bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool]) -> None:
-    """Receive a bus for ``receivers``, until ``stopped()``."""
+def hand_out(
+    bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool], shared: PresentEstimates | None = None
+) -> None:
+    """Receive a bus, and what the daemon ``shared`` of it, for ``receivers``, until ``stopped()``."""
     listener = Listener()
     bus.drain()
     while not stopped():
@@ -163,5 +167,10 @@ def hand_out(bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool
         time.sleep(_HEAR_S)
         listener.hear(bus.drain())
         now = time.monotonic_ns()
+        if shared:
+            shared.follow(now)
+            for row, corner in enumerate(listener.corners):
+                estimate = shared.of(row)
+                corner.facts = None if estimate is None else [TABLE[name].sentence for name in names(estimate["facts"])]
         for receiver in receivers:
             receiver.show(listener, now)

@@ -165,7 +165,10 @@ def open_bus(interface: str | None, channel: str | None, ids: list[int], **optio
         InputError: no interface is named, or an unknown one.
         Unavailable: it cannot be opened now.
     """
-    chosen = _choose_options({"interface": interface, "channel": channel, **options})
+    chosen: dict[str, Any] = {"interface": interface, "channel": channel, **options}
+    # python-can, which is slow to import, fills in what is not given.
+    if interface != "socketcan" or not channel:
+        chosen = _choose_options(chosen)
     if chosen["interface"] == "socketcan":
         return open_socketcan(str(chosen["channel"]), ids)
     # Its multicast loops back, so that programs on one machine can receive each other's frames.

@@ -179,8 +179,12 @@ class Daemon:
         self._reload_wanted = True
 
     def share(self, path: Path) -> None:
-        """Let other processes read the estimates of every tick in a file. Raises OSError if it cannot be written."""
-        self._shared = SharedEstimates(path, self.pipeline)
+        """Let other processes read the estimates of every tick in a file. If it cannot be written, the daemon runs without:
+        brakes need it more than those who look on."""
+        try:
+            self._shared = SharedEstimates(path, self.pipeline)
+        except OSError as error:
+            log.error("estimates are not shared: %s: %s", path, error.strerror)
 
     def take_pages(self, path: Path) -> None:
         """Accept requests for other calibrations from the reader of the estimates in ``path``. Raises Unavailable if the

@@ -7,13 +7,16 @@ import hashlib
 import mmap
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
-from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire.layout import CORNERS
+
+if TYPE_CHECKING:
+    from emb_daemon.pipeline import Pipeline
 
 #: Rows in the ring: two seconds of four corners at 250 Hz, enough for a reader of lowest priority.
 ROWS = 2048
@@ -36,6 +39,11 @@ SHARED = np.dtype(
     ],
     align=True,
 )
+#: Age up to which a row is of the present, ns: that of the first of the three messages in a row by which a trouble code fails.
+_PRESENT_NS = 300_000_000
+#: Looks without a row after which nobody is said to write any. It is no time: a reader of lowest priority may look seldom,
+#: and gets the first rows at its third look.
+_LOOKS = 15
 #: Version of the records above, on which writer and reader must agree.
 LAYOUT_DIGEST = hashlib.sha256(repr((SHARED.descr, SHARED.itemsize)).encode()).hexdigest()[:16].encode()
 
@@ -58,7 +66,7 @@ class SharedEstimates:
         pipeline: whose rows and parameters are shared.
     """
 
-    def __init__(self, path: Path, pipeline: Pipeline):
+    def __init__(self, path: Path, pipeline: "Pipeline"):
         """Raises OSError if the file cannot be written."""
         content = np.zeros((), SHARED)
         content["layout"], content["parameters"] = LAYOUT_DIGEST, pipeline.parameters
@@ -164,3 +172,32 @@ class EstimatesReader:
         lost = start - self._taken + torn
         self._taken = start + len(places)
         return samples[torn:], estimates[torn:], lost
+
+
+class PresentEstimates:
+    """The newest estimate of each corner, for readers that need no others.
+
+    Attributes:
+        trouble: why there are none; empty if there are.
+    """
+
+    def __init__(self, path: Path):
+        self._reader = EstimatesReader(path)
+        self._rows: dict[int, np.void] = {}
+        self._now_ns = self._in_vain = 0
+        self.trouble: str = ""
+
+    def follow(self, now_ns: int) -> None:
+        """Take what has been shared since the last call; ``now_ns`` on the monotonic clock."""
+        self._reader.look()
+        _, taken, _ = self._reader.take()
+        # A prediction knows neither the forces of the paths nor what is amiss.
+        self._rows.update((int(row["corner"]), row) for row in taken[taken["is_sample"]])
+        self._now_ns, self._in_vain = now_ns, 0 if len(taken) else self._in_vain + 1
+        why = self._reader.trouble or f"{self._reader.path}: no daemon shares its estimates there"
+        self.trouble = why if self._in_vain > _LOOKS else ""
+
+    def of(self, corner: int) -> np.void | None:
+        """ESTIMATE of a corner's newest sample; None if there is none of the present."""
+        row = self._rows.get(corner)
+        return None if row is None or self._now_ns - row["time_ns"] > _PRESENT_NS else row

@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from emb_daemon.adapt import files
+from emb_daemon.estimator.status import TABLE
 from emb_daemon.wire.contract import INIT, REASONS
 from emb_daemon.wire.layout import CORNERS
 
@@ -43,8 +44,9 @@ _INDEX = {code_of(*divmod(index, len(REASONS))): index for index in range(CODES)
 
 
 class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The estimate at one moment: ``time_s`` since 1970; forces N, temperatures degC, contact angle rad. The forces of the
-    separate paths are not on the bus; ``source`` says which of them the force is based on. None: not to be used."""
+    """The estimate at one moment: ``time_s`` since 1970; forces N, temperatures degC, contact angle rad, ``facts`` as
+    `estimator.status.names` has them. None: not to be used. Fields with that default are not on the bus; files of earlier
+    versions lack them."""
 
     time_s: int
     mode: int
@@ -54,10 +56,16 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     temperatures_C: tuple[float | None, ...]
     contact_angle_rad: float | None
     stiffness_factor: float | None
+    stiffness_force_N: float | None = None
+    stiffness_sigma_N: float | None = None
+    torque_force_N: float | None = None
+    torque_sigma_N: float | None = None
+    facts: tuple[str, ...] | None = None
 
     #: time u32, mode u8, source u8, force and sigma u16 N, four temperatures i16 0.1 degC, contact angle i16 0.1 rad,
-    #: stiffness factor u16 0.0001; big-endian. All ones, or the most negative number, mean: not to be used.
-    LAYOUT = ">IBBHHhhhhhH"
+    #: stiffness factor u16 0.0001, force and sigma of stiffness path and torque path u16 N, facts u32, a bit for each of the
+    #: table; big-endian. All ones, or the most negative number, mean: not to be used.
+    LAYOUT = ">IBBHHhhhhhHHHHHI"
 
     def encode(self) -> bytes:
         def unsigned(value: float | None, scale: float) -> int:
@@ -71,6 +79,9 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             unsigned(self.force_N, 1.0), unsigned(self.sigma_N, 1.0),
             *(signed(value, 0.1) for value in self.temperatures_C), signed(self.contact_angle_rad, 0.1),
             unsigned(self.stiffness_factor, 1e-4),
+            unsigned(self.stiffness_force_N, 1.0), unsigned(self.stiffness_sigma_N, 1.0),
+            unsigned(self.torque_force_N, 1.0), unsigned(self.torque_sigma_N, 1.0),
+            0xFFFFFFFF if self.facts is None else sum(1 << bit for bit, name in enumerate(TABLE) if name in self.facts),
         )  # fmt: skip
 
 
