@@ -304,3 +304,13 @@ def test_a_phase_that_nothing_tells_is_no_thickness_but_a_doubt():
     sigmas = [estimate(samples, with_effect("disc_thickness_variation", order_1_cosine_um=um))["sigma"] for um in (15.0, 0.0)]
     held = np.arange(len(samples)) > 2100
     assert np.all(sigmas[0][held] > 1.2 * sigmas[1][held])
+
+
+def test_a_caliper_keeps_its_temperature_when_its_thermocouple_is_lost():
+    """The motor beside it has not cooled to the datasheet's temperature either: its torque is what it was."""
+    p = with_effect("torque_constant_fade", fade_per_K=0.005, disc_share=0.0)
+    samples = drive()
+    samples["caliper"] = 90.0
+    whole = estimate(samples, p)["torque_force"]
+    samples["has_thermocouple"][1500:] = False
+    np.testing.assert_allclose(estimate(samples, p)["torque_force"][1500:], whole[1500:], rtol=0.02)

@@ -4,6 +4,8 @@ The magnets' temperature is not measured. It lies between that of the caliper, w
 heats the motor from the other side; a share says where.
 """
 
+import numpy as np
+
 from emb_daemon.effects.base import Effect, Parameter, Placebo, of_another_episode
 from emb_daemon.jit import Record, njit
 
@@ -11,12 +13,18 @@ from emb_daemon.jit import Record, njit
 RATED_C = 25.0
 
 
+#: Last temperature of the caliper, degC, which stays about that for minutes after its sensor is lost; whether there was one.
+_STATE = np.dtype([("heard", "?"), ("caliper", "f8")], align=True)
+
+
 @njit
-def term(p: Record, m: Record, disc: float, disc_known: bool) -> float:
+def term(p: Record, s: Record, m: Record, disc: float, disc_known: bool) -> float:
     """Relative change of the torque constant."""
-    if p.fade_per_K == 0.0 or not m.has_thermocouple:
+    if m.has_thermocouple:
+        s.heard, s.caliper = True, m.caliper
+    if p.fade_per_K == 0.0 or not s.heard:
         return 0.0
-    temperature = m.caliper + (p.disc_share * (disc - m.caliper) if disc_known else 0.0)
+    temperature = s.caliper + (p.disc_share * (disc - s.caliper) if disc_known else 0.0)
     return -p.fade_per_K * (temperature - RATED_C)
 
 
@@ -39,6 +47,7 @@ EFFECT = Effect(
     ),
     equation="K_m → K_m [1 − κ (T_caliper + w (T_disc − T_caliper) − 25 °C)]",
     source="NdFeB −0.09 to −0.12 %/K: Gieras, Permanent Magnet Motor Technology, 3rd ed., ch. 2",
+    state=_STATE,
     signal="caliper_temperature",
     manoeuvre="the same strokes with a cold and with a hot caliper",
     placebos=(Placebo("temperature of another episode", signal=of_another_episode),),
