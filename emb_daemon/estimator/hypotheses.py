@@ -568,13 +568,16 @@ def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, floa
     _share_out(s)
     rest = 1.0
     first = spread * s.error[FAST]
-    mean = variance = square = 0.0
+    mean = whole = variance = square = 0.0
     for kind in range(DRIFT):
         a = s.alternatives[kind]
         w = a.share
         rest -= w
         apart = a.shift + spread * a.error[FAST] - first
-        mean += w * apart
+        whole += w * apart
+        # What was likely from the start moves the force as far as there is evidence for it, and not for being not refuted.
+        likely = kind == KEPT_JUMP and a.prior > a.least
+        mean += w * apart * (min(max((a.log_odds - a.prior) / _SUSPECTED, 0.0), 1.0) if likely else 1.0)
         square += w * apart * apart
         to_force(h, s, spread, a.slope, s.force + a.shift, warmth)
         variance += w * force_variance(a.covariance, h)
@@ -583,5 +586,7 @@ def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, floa
     to_force(h, s, spread, s.slope, s.force, warmth)
     variance += rest * force_variance(s.covariance, h)
     grown = d.slope * warmth
-    variance += max(square - mean * mean, 0.0) + d.share * (drifted * drifted + grown * grown * _unseen_growth(d))
+    variance += max(square + mean * (mean - 2.0 * whole), 0.0) + d.share * (
+        drifted * drifted + grown * grown * _unseen_growth(d)
+    )
     return s.force + first + mean, sqrt(variance)
