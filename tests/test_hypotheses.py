@@ -181,18 +181,22 @@ def _longest(mask):
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-@pytest.mark.parametrize("seed", [2, 3, 5])
+@pytest.mark.parametrize("stops", [8, 40])
 @pytest.mark.parametrize("factor", [0.9, 1.1])
-def test_pads_that_a_poor_torque_cannot_tell_from_the_calibrations_stay_possible(p, factor, seed):
+def test_pads_that_a_poor_torque_cannot_tell_from_the_calibrations_stay_possible(p, factor, stops):
     """A torque that is known to a fifteenth of the force refutes no other pads within a stop: they are not forgotten with the
-    first release."""
+    first release, nor after some stops. In up to a third of the drives noise speaks as clearly against them as a good torque
+    would; of those without this promise none is covered."""
     p["torque_lasting_sigma"] = 1.0 / 15.0
     true = p.copy()
     true["curve"] = factor * true["curve"]
-    rows, force = brake.samples(true, brake.stops(p, 8, seed))
-    estimates = estimate(brake.noisy(rows, p, seed), p)
-    clamped = force > 1000.0
-    assert np.mean(np.abs(estimates["force"] - force)[clamped] > 3.0 * estimates["sigma"][clamped]) < 0.01
+    shares = []
+    for seed in range(1, 13):
+        rows, force = brake.samples(true, brake.stops(p, stops, seed))
+        estimates = estimate(brake.noisy(rows, p, seed), p)
+        clamped = force > 1000.0
+        shares.append(np.mean(np.abs(estimates["force"] - force)[clamped] > 3.0 * estimates["sigma"][clamped]))
+    assert np.sum(np.array(shares) < 0.01) >= 8, shares
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -250,22 +250,19 @@ def test_sigma_grows_outside_of_the_range(calibration):
     assert sigma[1] < 1.1 * sigma[0] and sigma[2] > 3.0 * sigma[0]
 
 
-@pytest.mark.parametrize("heard", ["pulses", "vehicle", None])
-@pytest.mark.parametrize("wheel_speed", [None, 0.0])
-def test_a_term_over_a_disc_speed_that_is_lost_or_contradicted_is_told_by_others_or_doubted(calibration, heard, wheel_speed):
+_OVER_SPEED = {"signal": "disc_speed", "shape": "odd_power", "scale": 40.0, "low": 0.0, "high": 40.0}
+_WHILE_TURNING = {"signal": "clamp_force", "shape": "constant", "gate": "turning", "low": 0.0, "high": 2e4}
+
+
+@pytest.mark.parametrize("form", [_OVER_SPEED, _WHILE_TURNING])
+@pytest.mark.parametrize(
+    ("heard", "wheel_speed"), [("pulses", None), ("pulses", 0.0), ("vehicle", None), ("vehicle", 0.0), (None, None)]
+)
+def test_a_term_over_a_disc_speed_that_is_lost_or_contradicted_is_told_by_others_or_doubted(
+    calibration, heard, wheel_speed, form
+):
     """Pulses or the vehicle's speed tell the disc's to some hundredths; without any the term may be all that it can be."""
-    if heard is None and wheel_speed is not None:
-        return
-    term = Term(
-        name="term:x",
-        port="stiffness",
-        signal="disc_speed",
-        shape="odd_power",
-        coefficient=0.3,
-        scale=40.0,
-        low=0.0,
-        high=40.0,
-    )
+    term = Term(name="term:x", port="stiffness", coefficient=0.3, **form)
     p = held(to_parameters(msgspec.structs.replace(calibration, terms=(term,))))
     samples = drive()
     samples["has_wheel_speed"], samples["wheel_speed"] = True, 30.0

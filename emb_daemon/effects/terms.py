@@ -73,8 +73,8 @@ TERM = np.dtype(
 )
 #: ``other``: the signal that multiplies; negative for none. ``most``: what the term adds or subtracts at most in its range.
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
-#: ``added`` and its standard deviation ``outside`` of the terms' range, by port in its unit; ``sigma`` and ``torque_sigma``:
-#: what the latter makes of the static force (N) and of the torque (N m).
+#: ``added`` and its standard deviation ``outside`` of the terms' range, or without their signals, by port in its unit;
+#: ``sigma`` and ``torque_sigma``: what the latter makes of the static force (N) and of the torque (N m).
 STATE = np.dtype(
     [
         ("signal", "f8", (len(SIGNALS),)),
@@ -195,7 +195,7 @@ def _value(q, t, k, dt, maximum_force):
 
 
 @njit
-def _outside_sigma(q, signal, added, unsure):
+def _unsure_by(q, signal, added, unsure):
     """Standard deviation in the port's unit: that of the coefficient, and the term's own size times the distance of its
     signals from their range, in widths of the range; all that the term can be if a signal is not known. ``unsure``: how far
     the disc's speed may be off, share."""
@@ -248,7 +248,7 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
         q = e.term[k]
         value = _value(q, t, k, m.dt, p.maximum_force)
         t.added[q.port] += value
-        sigma = _outside_sigma(q, t.signal, value, unsure)
+        sigma = _unsure_by(q, t.signal, value, unsure)
         if sigma > 0.0:
             t.outside[q.port] = hypot(t.outside[q.port], sigma)
             if q.port <= _STATIC_FORCE:
