@@ -272,7 +272,7 @@ def test_a_term_over_a_disc_speed_that_is_lost_or_contradicted_is_told_by_others
         samples["has_wheel_pulse"] = True
         samples["wheel_pulse"] = np.floor(np.cumsum(samples["dt"]) * 30.0 * 96 / (2.0 * np.pi)) % 4096
     elif heard == "vehicle":
-        samples["has_status"], samples["vehicle_speed"] = True, 30.0 * 0.32
+        samples["has_status"], samples["vehicle_speed"] = True, 30.0 * 0.34  # of larger wheels
     found = estimate(samples, p)
     clamped = (np.cumsum(samples["dt"]) > 2.0) & (healthy["force"] > 3000.0)
     off = (found["stiffness_force"] - healthy["stiffness_force"])[clamped]
