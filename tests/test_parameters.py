@@ -12,7 +12,7 @@ from emb_daemon.adapt.records import to_limits
 from emb_daemon.calibration import parameters
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import in_words, keys, moved, parameter, value_of
-from emb_daemon.calibration.types import Adaptation, Calibration, ForceSensor, to_parameters
+from emb_daemon.calibration.types import AdaptationLimits, Calibration, ForceSensor, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.resources import resource
@@ -196,7 +196,7 @@ def test_what_is_no_number_is_declared():
     """Fields that are neither parameters nor switches of adaptation: identity and documentation."""
     plain = {name.partition(".")[0].partition("[")[0] for name in _KEYS}
     assert set(Calibration.__struct_fields__) - plain == {"format", "actuator", "terms", "provenance"}
-    assert {field for field in Adaptation.__struct_fields__ if f"adaptation.{field}" not in _KEYS} == {
+    assert {field for field in AdaptationLimits.__struct_fields__ if f"adaptation.{field}" not in _KEYS} == {
         "enabled", "samples_per_range", "high_force_N"}  # fmt: skip
 
 

@@ -31,7 +31,7 @@ TRAINING = np.dtype(
     align=True,
 )
 
-#: Limits that the tick reads, from the calibration; see `calibration.types.Adaptation` for their meaning. ``estimated``:
+#: Limits that the tick reads, from the calibration; see `calibration.types.AdaptationLimits` for their meaning. ``estimated``:
 #: whether this process estimates the corner at all.
 LIMITS = np.dtype(
     [

@@ -298,7 +298,7 @@ class Thermal(Struct, kw_only=True):
     sigma_K: Positive = 5.0
 
 
-class Adaptation(Struct, kw_only=True):
+class AdaptationLimits(Struct, kw_only=True):
     """Limits of park brake adaptation (thesis 3.4): when training may run, which motion it requests, what it may learn."""
 
     #: Whether the daemon requests training and learns from it.
@@ -405,7 +405,7 @@ class Calibration(Struct, kw_only=True):
     #: Terms that are not in the catalogue of effects; `emb-daemon diagnose` makes them.
     terms: tuple[Term, ...] = ()
     #: Limits of park brake adaptation.
-    adaptation: Adaptation = Adaptation()
+    adaptation: AdaptationLimits = AdaptationLimits()
     provenance: Provenance | None = None
 
     def __post_init__(self) -> None:

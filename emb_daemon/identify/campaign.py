@@ -10,7 +10,7 @@ import numpy as np
 from emb_daemon.calibration.fields import Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling, Training, Trial
+from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling, Recording, Training
 from emb_daemon.jit import njit
 from emb_daemon.logs.contradictions import other_motor
 from emb_daemon.logs.read import read_with_digest
@@ -93,7 +93,7 @@ class Campaign:
         """Of the pads that the calibration is for."""
         return self.file.pad_thickness_mm or self.datasheet.pad.thickness_mm
 
-    def thickness(self, entry: Trial | Training) -> float:
+    def thickness(self, entry: Recording | Training) -> float:
         """Pad thickness of an entry in mm; the campaign's where it states none."""
         return entry.pad_thickness_mm or self.pad_thickness_mm
 

@@ -14,7 +14,7 @@ from emb_daemon.wire.contract import PULSES_PER_TURN
 _TOLERANCE = 0.15
 
 
-class Trial(Struct, kw_only=True):
+class Recording(Struct, kw_only=True):
     """One log, recorded with pads of one thickness."""
 
     #: Log file, relative to the campaign.
@@ -23,7 +23,7 @@ class Trial(Struct, kw_only=True):
     pad_thickness_mm: Positive | None = None
 
 
-class Sine(Trial, kw_only=True):
+class Sine(Recording, kw_only=True):
     """A log in which the motor angle is a sinusoid."""
 
     #: Frequency of the sinusoid.
@@ -90,10 +90,10 @@ class CampaignFile(Struct, kw_only=True):
     pad_thickness_mm: Positive | None = None
     #: Slow clamp and release between the released position and the largest force, some ten seconds each way: for curve and
     #: friction.
-    curves: tuple[Trial, ...] = ()
+    curves: tuple[Recording, ...] = ()
     #: A new random motor angle every 100 ms between released and clamped, beginning released: for relaxation, inertia and
     #: friction.
-    random: tuple[Trial, ...] = ()
+    random: tuple[Recording, ...] = ()
     #: Trainings with other pads, without reference force, for the study of adaptation. Identification uses only their `judge`.
     adaptation: tuple[Training, ...] = ()
     #: Logs with sinusoids, for figures over frequency.
