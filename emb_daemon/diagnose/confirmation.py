@@ -93,17 +93,24 @@ def _against(
         rest = {suspect: unseen(left_out_errors(selection, suspect), suspect).rmse(main) for suspect in selection.suspects}
         where = "left-out episodes and validation logs" if beside else "left-out episodes"
         return min(rest, key=rest.__getitem__), f"{worse} on {where}"
-    if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[1])):
+    # A large gain may cost a log that had hardly any error a little.
+    gained = max(before.rmse(main) ** 2 - after.rmse(main) ** 2, 0.0)
+    if (ruined := _ruined(bench, before, after, main, gained)) and (guilty := _guilty(selection, ruined[1])):
         told, own = ruined
         rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in guilty}
         return min(rest, key=rest.__getitem__), f"{told} on left-out episodes"
     return None
 
 
-def _ruined(bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str) -> tuple[str, np.ndarray] | None:
-    """What became of the log whose ``main`` error rose most, where that is clear, and which episodes are its own."""
+def _ruined(
+    bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str, gained: float = 0.0
+) -> tuple[str, np.ndarray] | None:
+    """What became of the log whose ``main`` error rose most, where that is clear and more than was ``gained`` over all logs
+    (mean square, N²), and which episodes are its own."""
     first, last = by_log(bench, before, main), by_log(bench, after, main)
-    ratios = np.nan_to_num(np.divide(last, first, out=np.zeros_like(last), where=first > 0.0))
+    ratios = np.nan_to_num(
+        np.divide(last, first, out=np.zeros_like(last), where=(first > 0.0) & (last**2 - first**2 > gained))
+    )
     worst = int(np.argmax(ratios))
     if ratios[worst] <= _LOG_HARM:
         return None
