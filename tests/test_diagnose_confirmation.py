@@ -298,10 +298,14 @@ def test_a_path_that_is_no_number_any_more_has_got_worse():
     assert not confirmation.harm(before, EpisodeErrors.of(better, {}, episode), "fused")
 
 
-@pytest.mark.parametrize(("own_data", "own_path_N", "guilty"), [(False, 10.0, True), (True, 10.0, False), (True, 50.0, True)])
-def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, own_data, own_path_N, guilty):
+@pytest.mark.parametrize(
+    ("own_data", "own_path_N", "gains_N", "guilty"),
+    [(False, 10.0, 50.0, True), (True, 10.0, 50.0, False), (True, 50.0, 50.0, True), (False, 10.0, 500.0, False)],
+)
+def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, own_data, own_path_N, gains_N, guilty):
     """A log that is off by far outweighs the others: a little gained there would pay for anything lost elsewhere. Where the
-    noise will be stated anew, what leaves less of its own path on that log (20 N without it) has not ruined it."""
+    noise will be stated anew, what leaves less of its own path on that log (20 N without it) has not ruined it, and neither
+    has what gains all together by a larger factor."""
     episode = np.repeat(np.arange(4), 100)
     trials = [SimpleNamespace(episode=episode, log=SimpleNamespace(path=Path(name))) for name in ("far.log", "near.log")]
     by_sample = np.repeat(np.arange(8), 100)
@@ -335,7 +339,8 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
 
     def left_out(chosen, without=""):
         there = {*chosen.suspects} - {without}
-        return of(1000.0 - 50.0 * len(there), 60.0 if "wrong" in there else 32.0)
+        far_N = 1000.0 - 50.0 * ("right" in there) - gains_N * ("wrong" in there)
+        return of(far_N, 60.0 if "wrong" in there else 32.0)
 
     monkeypatch.setattr(confirmation, "errors", lambda *_: of(1000.0, 30.0))
     monkeypatch.setattr(confirmation, "whole", lambda _: "fused")

@@ -1,10 +1,10 @@
 """Confirmation: the running estimator itself must improve on data that were not fitted.
 
 Every accepted suspect must lower the residual of its own path on episodes left out of the fit, with the contact angle held,
-because otherwise that would take over an error of the other path and contradict a true term. The error of the fused force must
-not rise either, nor clearly that of a single log: a fit that gains a little on a log with large errors may ruin all others,
-which the mean would not show. Validation logs, if given, have a veto. What fails is taken out one by one, and the rest is
-refitted.
+because otherwise that would take over an error of the other path and contradict a true term. The error of the fused force
+must not rise either, nor clearly that of a single log, unless all together gain by a larger factor: a fit that gains a little
+on a log with large errors may ruin all others, which the mean would not show. Validation logs, if given, have a veto. What
+fails is taken out one by one, and the rest is refitted.
 """
 
 from collections.abc import Iterator, Mapping
@@ -93,24 +93,25 @@ def _against(
         rest = {suspect: unseen(left_out_errors(selection, suspect), suspect).rmse(main) for suspect in selection.suspects}
         where = "left-out episodes and validation logs" if beside else "left-out episodes"
         return min(rest, key=rest.__getitem__), f"{worse} on {where}"
-    # A large gain may cost a log that had hardly any error a little.
-    gained = max(before.rmse(main) ** 2 - after.rmse(main) ** 2, 0.0)
-    if (ruined := _ruined(bench, before, after, main, gained)) and (guilty := _guilty(selection, ruined[1])):
+    if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[1])):
         told, own = ruined
-        rest = {suspect: left_out_errors(selection, suspect).rmse(main, weights=own) for suspect in guilty}
-        return min(rest, key=rest.__getitem__), f"{told} on left-out episodes"
+        rest = {suspect: _both(left_out_errors(selection, suspect), main, own) for suspect in guilty}
+        worst = min(rest, key=rest.__getitem__)
+        if rest[worst] < _both(after, main, own):
+            return worst, f"{told} on left-out episodes"
     return None
 
 
-def _ruined(
-    bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str, gained: float = 0.0
-) -> tuple[str, np.ndarray] | None:
-    """What became of the log whose ``main`` error rose most, where that is clear and more than was ``gained`` over all logs
-    (mean square, N²), and which episodes are its own."""
+def _both(judged: EpisodeErrors, main: str, own: np.ndarray) -> float:
+    """A log's ``main`` error, its episodes being the ``own`` ones, times that of all logs, N²: what costs the one by a larger
+    factor than it gains all raises it. By mean squares a little gained where the error is large would pay for anything."""
+    return judged.rmse(main, weights=own) * judged.rmse(main)
+
+
+def _ruined(bench: Bench, before: EpisodeErrors, after: EpisodeErrors, main: str) -> tuple[str, np.ndarray] | None:
+    """What became of the log whose ``main`` error rose most, where that is clear, and which episodes are its own."""
     first, last = by_log(bench, before, main), by_log(bench, after, main)
-    ratios = np.nan_to_num(
-        np.divide(last, first, out=np.zeros_like(last), where=(first > 0.0) & (last**2 - first**2 > gained))
-    )
+    ratios = np.nan_to_num(np.divide(last, first, out=np.zeros_like(last), where=first > 0.0))
     worst = int(np.argmax(ratios))
     if ratios[worst] <= _LOG_HARM:
         return None
