@@ -763,6 +763,20 @@ def test_the_scale_that_training_cannot_see_stays_in_sigma(ideal):
     assert why_out_of_bounds(believed(), found.values | {"noise.stiffness_relative": 0.005})
 
 
+def test_a_torque_that_is_off_for_a_while_teaches_no_other_pads(ideal):
+    """A gear that passes less at high force looks like pads that are softer there. Where the calibration says that the torque
+    is off by some per cent in some stops, pads that are further off are learned, with that in sigma."""
+    rows = trained_rows(ideal)
+    rows["current_q"] *= 1.0 - 0.06 * np.clip((rows["angle"] - ideal["clearance"]) / 20.0, 0.0, 1.0)
+    stated = moved(IDEAL, {"noise.torque_lasting": 0.04})
+    fooled, kept = fit(rows, IDEAL), fit(rows, stated)
+    assert fooled.evidence["curve_changed"] and not kept.evidence["curve_changed"]
+    assert kept.values["noise.stiffness_relative"] == stated.noise.stiffness_relative
+    softer = fit(trained_rows(ideal), believed(stated))
+    assert softer.outcome == r.ACCEPTED and softer.evidence["curve_changed"]
+    assert softer.values["noise.stiffness_relative"] > 0.04
+
+
 @pytest.fixture(scope="module")
 def acceptable():
     """(TRAINING rows, calibration) of a training that is accepted with the usual limits."""

@@ -71,6 +71,8 @@ _FAR, _FEW = 8.0, 0.05
 #: The pads count as changed if fitting a new curve lowers the cost by this much, per correlated block: with three coefficients
 #: noise alone does so once in a thousand trainings (chi-square).
 _UNCHANGED = 16.0
+#: The same if its forces differ by this many standard deviations of the torque path's lasting error (95 %).
+_LASTING = 2.0
 #: Lags over which the residual's autocorrelation inflates the covariance.
 _LAGS = 12
 #: Least number of samples of a training, four seconds; number of equal force ranges that must be passed in each direction.
@@ -299,14 +301,14 @@ def _fit_with_and_without_curve(training, x, curve, offset_friction):
     if held.cost < free.cost:
         # A fit with more freedom cannot be worse: it started too far off and ended at a curve that does not rise at contact.
         free = _fit(training, held.x, steps, with_curve)
-    if _as_good(held, free):
+    if _as_good(training, held, free):
         # The inertia distinguishes torque constant and stiffness only as well as it is known itself.
         return _fit(training, held.x, steps, np.arange(_CURVE), inertia_sigma=INERTIA_SIGMA), True
     # An inertia that differs from the calibration makes motor and pads look stronger by the same share.
     kept = np.concatenate([free.x[:_CURVE], curve])
     kept[_GAIN] = 0.0
     held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
-    if _as_good(held, free):
+    if _as_good(training, held, free):
         return held, True
     # Either the magnets have lost strength or the rotor is another unit's. The contradiction between inertia and torque
     # constant may be an error of either; its size gives the standard deviation of both (the most likely one of two values, by
@@ -315,9 +317,14 @@ def _fit_with_and_without_curve(training, x, curve, offset_friction):
     return _fit(training, free.x, steps, np.arange(len(x)), apart, apart), False
 
 
-def _as_good(held, fit):
-    """Whether a fit with the curve held explains a training as well as one with a curve of its own."""
-    return held.iterations > 0 and (held.cost - fit.cost) / fit.spread < _UNCHANGED
+def _as_good(training, held, fit):
+    """Whether a fit with the curve held explains a training as well as one with a curve of its own, or by forces that differ
+    by less than the torque path may be off for the length of a training."""
+    if held.iterations < 0:
+        return False
+    apart = np.linalg.norm(held.force - fit.force) / np.linalg.norm(fit.force)
+    lasting = training.calibration.noise.torque_lasting
+    return (held.cost - fit.cost) / fit.spread < _UNCHANGED or apart < _LASTING * lasting
 
 
 def _inverse(normal):
@@ -451,8 +458,10 @@ def _learned_values(training, fit, unchanged, base, top, factor_sigma):
     if unchanged:
         values |= {key: value_of(calibration, key) for key in (STIFFNESS_SIGMA, STIFFNESS_RELATIVE_SIGMA)}
     else:
-        # Errors that the fit cannot see but the curve inherits: of the dynamics, the gear gain and the pad temperature.
-        scale_sigma = hypot(gain_sigma, calibration.adaptation.torque_constant_relative, factor_sigma)
+        # Errors that the fit cannot see but the curve inherits: of the dynamics, the gear gain, the torque path and the pad
+        # temperature.
+        unseen = calibration.adaptation.torque_constant_relative, calibration.noise.torque_lasting, factor_sigma
+        scale_sigma = hypot(gain_sigma, *unseen)
         values[STIFFNESS_SIGMA] = hypot(constant, base.noise.stiffness_N)
         values[STIFFNESS_RELATIVE_SIGMA] = hypot(relative, scale_sigma)
     return values, {"force_sigma_N": force_sigma, "top_force_N": float(characteristic_curve(top, curve)[0])}
