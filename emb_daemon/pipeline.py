@@ -375,7 +375,6 @@ def _head(b, row, index, age):
             reasons |= contract.E2E_ERROR
         if now - b.receptions[slot].range_ns < _SHOWN_NS:
             reasons |= contract.OUT_OF_RANGE
-    for slot in (base + wire.RESOLVER, base + wire.CURRENT):
         if now - b.receptions[slot].contested_ns < _SHOWN_NS:
             reasons |= contract.CONTESTED
     if corner.unproven:

@@ -249,6 +249,12 @@ class TestPacer:
         pacer.last_tick_ns = 9 * CYCLE_NS
         assert pacer.next_wake(9 * CYCLE_NS + 1) <= 10 * CYCLE_NS + 500_000
 
+    def test_who_is_four_cycles_late_is_waited_for_no_more(self):
+        pacer = Pacer(0)
+        pacer.note_arrival(0, 0)
+        pacer.last_tick_ns = now = 4 * CYCLE_NS
+        assert pacer.next_wake(now) < now and pacer.next_wake(now + 1) == 5 * CYCLE_NS
+
 
 #: Arguments: configuration, frames, state folder. A second start goes on from what the first one left.
 _COMPILES_NOTHING = """

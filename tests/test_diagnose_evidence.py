@@ -230,6 +230,13 @@ def test_a_pause_of_less_than_a_third_of_a_second_ends_no_application():
     assert np.setdiff1d(long, short) == pytest.approx([199.84], abs=0.011) and not len(np.setdiff1d(short, long))
 
 
+def test_of_short_applications_that_ends_an_episode_which_is_half_a_second_after_the_last_end():
+    """Each of 0.2 s, with pauses of 0.35 s: the first has no episode of its own."""
+    time = np.arange(0.0, 6.0, 0.01)
+    number = episodes(time, np.where((time + 0.345) % 0.55 > 0.35, 5000.0, 0.0), np.zeros(len(time)))
+    assert time[np.flatnonzero(np.diff(number)) + 1] == pytest.approx(np.arange(0.76, 5.8, 0.55), abs=0.011)
+
+
 def test_a_hold_is_one_episode_however_long():
     """Two halves of a hold would vouch for each other: what is aliased in one is aliased in the other."""
     time = np.arange(0.0, 100.0, 0.004)

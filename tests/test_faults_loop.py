@@ -475,4 +475,4 @@ def test_swapped_messages_of_a_pair_are_one_sample(car):  # noqa: F811
     estimates, _ = _run(car, frames[np.argsort(frames["time_ns"], kind="stable")])
     straight, _ = _run(car, np.concatenate(_sliding(300)))
     assert len(estimates) == 300 and not estimates["reasons"].any()
-    np.testing.assert_allclose(estimates["force"], straight["force"], atol=1.0)
+    np.testing.assert_array_equal(estimates["force"], straight["force"])

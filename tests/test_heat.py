@@ -4,7 +4,9 @@ import naive
 import numpy as np
 import pytest
 
+from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, heat_step, mean_temperature
+from emb_daemon.offline import estimate
 
 
 @pytest.fixture
@@ -137,3 +139,18 @@ def test_without_heating_nothing_leaves_the_range_of_its_surroundings(thermal, d
         low, high = min(pads.min(), disc, 20.0), max(pads.max(), disc)
         disc = heat_step(thermal, pads, disc, 20.0, 20.0, 20.0, 0.0, step % 2 == 0, 10.0, dt, work, LONGEST_S, UNALTERED)
         assert low - 1e-9 <= min(pads.min(), disc) and max(pads.max(), disc) <= high + 1e-9
+
+
+def test_pads_forget_their_temperature_over_the_time_of_the_calibration(parameters):
+    rows, state = np.zeros(10_000, SAMPLE), new_state()
+    rows["dt"][1:], rows["angle"], rows["brake_torque"] = 0.004, 17.5, np.nan
+    for name in ("inner_backplate", "outer_backplate", "caliper", "ambient"):
+        rows[name] = 120.0
+    rows["has_thermocouple"] = rows["has_status"] = True
+    thermal = parameters[0]["thermal"]
+    thermal["history_time"] = 20.0
+    first = estimate(rows[:5000], parameters[:1], state)
+    remembered = state[0]["history"]
+    warm = estimate(rows[5000:], parameters[:1], state)["mean"].mean(axis=1) - thermal["reference"]
+    assert len(first) and remembered < 0.9 * warm[0] and np.ptp(warm) < 1.0
+    assert warm[-1] - state[0]["history"] == pytest.approx((warm[0] - remembered) * np.exp(-1.0), rel=0.05)

@@ -86,6 +86,23 @@ def test_who_contradicts_a_sender_at_the_right_time_makes_the_force_a_fault(car,
     assert max(frame["DegradedReasons"] for frame in told) < 1 << 16 and {frame["Mode"] for frame in told} >= {r.FAULT}
 
 
+@pytest.mark.parametrize("can_id", [0x120, 0x180, 0x181, 0x182])
+def test_who_contradicts_any_other_input_makes_it_a_fault_too(car, can_id):  # noqa: F811
+    """A forged vehicle status says that a clamped brake is released, of which a filter that starts anew would begin."""
+    frames = _merged(_good(700))
+    own = (frames["can_id"] == can_id) & (frames["time_ns"] > 150 * CYCLE_NS) & (frames["time_ns"] < 230 * CYCLE_NS)
+    forged = frames[own].copy()
+    forged["data"] ^= np.uint64(1 << 16)
+    forged["time_ns"] -= MS
+    attacks._protect_anew(forged)
+    estimates, _ = _run(car, _merged(frames, forged))
+    first, last = forged["time_ns"][[0, -1]]
+    contested = (estimates["time_ns"] > first + 2 * CYCLE_NS) & (estimates["time_ns"] < last + 995 * MS)
+    assert len(forged) >= 3 and np.all(estimates["mode"][contested] == r.FAULT)
+    assert np.all(estimates["reasons"][contested] & r.E2E_ERROR)
+    assert np.all(estimates["mode"][estimates["time_ns"] > last + 1015 * MS] != r.FAULT)
+
+
 @pytest.mark.parametrize("learns", [False, True])
 def test_what_was_learned_from_two_senders_is_forgotten(learns, tmp_path):
     """Samples of 3 s ago instead of the genuine ones teach the filter a contact that is not there. When they end, the brake

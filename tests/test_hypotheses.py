@@ -40,7 +40,7 @@ from emb_daemon.estimator.hypotheses import (
     weigh,
 )
 from emb_daemon.estimator.records import new_state
-from emb_daemon.estimator.unknown import set_priors
+from emb_daemon.estimator.unknown import set_priors, torque_offset
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -168,7 +168,7 @@ def test_a_change_is_attributed_and_ends_in_a_small_error(p, name, seed):
             expected.get(what, 0.0), abs=max(nothing, 0.15 * abs(expected.get(what, 0.0)))
         ), what
     silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
-    assert _longest(silent) <= 30
+    assert _longest(silent) <= 25
     told = estimates["reasons"][-6 * _STOP :]
     assert not np.any(told & ~CONTACT_UNCERTAIN)
     # What jumped once may again: a sample or two at the beginning of a stop are open by more than a hundredth.
@@ -217,6 +217,17 @@ def test_a_current_sensor_that_drifts_takes_no_force_with_it(p, ampere_per_s, se
     error, clamped = estimates["force"] - force, force > 500.0
     assert np.sqrt(np.mean(error[clamped] ** 2)) < 60.0
     assert np.mean(np.abs(error) < 2.0 * estimates["sigma"]) > 0.95
+
+
+@pytest.mark.parametrize("ampere_per_s", [-0.12, 0.12])
+def test_a_current_sensor_that_has_drifted_by_twice_a_healthy_ones_offset_is_told(p, ampere_per_s):
+    rows, _ = brake.samples(p, brake.stops(p, 18))
+    rows = brake.noisy(rows, p)
+    drifted = ampere_per_s * np.maximum(np.cumsum(rows["dt"]) - 5.0, 0.0)
+    rows["current_q"] += drifted
+    told = estimate(rows, p)["reasons"] & PATHS_DISAGREE > 0
+    healthy = np.abs(drifted) * p["torque_constant"] / torque_offset(p)
+    assert np.all(told[healthy > 2.1]) and np.mean(told[healthy < 1.9]) < 0.05
 
 
 @pytest.mark.parametrize("times", [4.0, 6.0])

@@ -438,6 +438,18 @@ def test_a_flood_of_authentication_frames_costs_a_bounded_number_of_tries():
         assert set(heard["flags"].tolist()) == {expected}, (count, later_ns)
 
 
+def test_an_authentication_is_tried_on_each_pair_that_waits_and_on_no_other():
+    """With the Counter that places without a frame have."""
+    judge, last = verifier(), of(signed(), AUTH)[100]
+    judge.verify(signed()[: last + 1])
+    waiting = np.repeat(signed()[last - 2 : last + 1], (3, 2, 1))
+    assert waiting["can_id"].tolist() == [0x100] * 3 + [0x110] * 2 + [AUTH]
+    waiting["time_ns"] += CYCLE_NS
+    waiting["data"] = (np.arange(6, dtype=np.uint64) + np.uint64(1)) << np.uint64(56)
+    waiting["data"][-1] |= np.uint64(250 << 20)
+    assert set(judge.verify(waiting)["flags"].tolist()) == {UNAUTHENTIC} and judge.links["tries"][0] == 6
+
+
 def test_more_than_eight_frames_that_wait_are_refused_the_oldest_first():
     judge = verifier()
     judge.verify(signed()[: of(signed(), AUTH)[100] + 1])

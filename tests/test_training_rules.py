@@ -6,8 +6,9 @@ import pytest
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt import training
-from emb_daemon.adapt.learned import Evaluation
+from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, Evaluation, learned_keys, why_out_of_bounds
 from emb_daemon.adapt.memory import entry_of
+from emb_daemon.calibration.parameters import CLEARANCE, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.hypotheses import DRIFT
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, new_state
@@ -604,3 +605,22 @@ def test_a_new_curve_is_known_as_the_stroke_knows_it():
 def test_pads_that_moved_by_more_than_they_settle_are_others_though_their_curve_is_the_same():
     _, state, a, _ = applied(kept=True, moved=5.0)
     assert state["contact_angle"] == a["contact_angle"] and state["scale"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "fits"),
+    [(0.42, True), (0.38, False), (1.58, True), (1.62, False)],
+    ids=["less", "too little", "more", "too much"],
+)
+def test_friction_at_full_force_changes_by_no_more_than_its_limit(change, fits):
+    """0.6 of what was calibrated, to either side; the clearance by as many radians to either side as its own limit says."""
+    calibration = adaptkit.shipped()
+    values = {key: value_of(calibration, key) for key in learned_keys(calibration)}
+    friction = {key: change * values[key] for key in (LOAD_FRICTION, OFFSET_FRICTION)}
+    why = why_out_of_bounds(calibration, values | friction)
+    assert (why == "") == fits and (fits or why.startswith("friction at full force"))
+    for way in (-1.0, 1.0):
+        for share in (0.99, 1.01):
+            moved_rad = way * share * calibration.adaptation.clearance_change_rad
+            why = why_out_of_bounds(calibration, values | {CLEARANCE: values[CLEARANCE] + moved_rad})
+            assert (why == "") == (share < 1.0), why

@@ -93,6 +93,7 @@ def test_a_slow_drift_is_told_within_half_a_minute_and_covered(p, rad_per_s, see
     estimates, force = _estimated(p, drift, seed)
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and begin < told[0] < begin + 30 / _DT
+    assert np.mean(estimates["source"] == r.FUSED) > 0.99
     assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
 
 
@@ -101,6 +102,7 @@ def test_half_a_percent_of_lost_counts_is_told_and_covered(p, seed):
     estimates, force = _estimated(p, lambda rows: brake.lose_counts(rows, 0.005), seed)
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and told[0] < 60 / _DT
+    assert np.mean(estimates["source"] == r.FUSED) > 0.99
     assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
 
 

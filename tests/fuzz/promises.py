@@ -5,9 +5,9 @@ each time with other foreign frames and losses on the bus, drawn from the seed:
 
 - *noise*: frames on any id, none of them with the right protection. Every genuine frame is taken, no other is, and the
   estimates are the same to the bit.
-- *hostile*: protected frames with any payload, counter, status and time, while genuine ones are lost, doubled, held up or
-  damaged. What was taken is within its range, an estimate that may be used is a number with a sigma, and what is sent is
-  protected, in sequence, and says of itself what the estimate says.
+- *hostile*: genuine frames are lost, doubled, held up or damaged, and for a fifth of the drive there are protected frames with
+  any payload, counter, status and time. What was taken is within its range, an estimate that may be used is a number whose
+  sigma covers the true force, and what is sent is protected, in sequence, and says of itself what the estimate says.
 """
 
 import sys
@@ -31,14 +31,19 @@ from emb_daemon.wire.receive import ACCEPTED
 
 _OURS = np.array([0x100, 0x110, 0x120, 0x180, 0x181, 0x182, 0x200])
 _START_NS = 1_000_000_000
+#: Share of the samples that may be off by more than three sigma, as in `studies.phases`; and cycles by which a frame that was
+#: held up, and the sample counted by it, may be late.
+_BEYOND, _LATE_CYCLES = 0.01, 13
 _KEPT = ("time_ns", "cycle", "counter", "source", "force", "sigma", "stiffness_force", "contact_angle", "disc", "mean")
 
 
 @cache
-def _drive(seconds: float) -> np.ndarray:
+def _drive(seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frames, and the true force of each cycle, N."""
     plant = np.array([plant_from_calibration(load_calibration(resource("config/calibration.yaml")), 0)])
     schedule = city_drive().first(seconds)
-    return Car(plant, ("FL",), start_ns=_START_NS).run(commands_of(schedule, ("FL",)), schedule.drives)[0]
+    frames, truth = Car(plant, ("FL",), start_ns=_START_NS).run(commands_of(schedule, ("FL",)), schedule.drives)
+    return frames, truth["force"][:, 0]
 
 
 def _run(frames: np.ndarray):
@@ -78,9 +83,9 @@ def _wrongly_protected(frames):
     return count
 
 
-def _foreign(rng: np.random.Generator, count: int, end_ns: int) -> np.ndarray:
+def _foreign(rng: np.random.Generator, count: int, begin_ns: int, end_ns: int) -> np.ndarray:
     frames = np.zeros(count, FRAME)
-    frames["time_ns"] = np.sort(rng.integers(_START_NS, end_ns, count))
+    frames["time_ns"] = np.sort(rng.integers(begin_ns, end_ns, count))
     frames["can_id"] = np.where(rng.random(count) < 0.9, rng.choice(_OURS, count), rng.integers(0, 2048, count))
     frames["length"], frames["data"] = 8, rng.integers(0, 2**64, count, dtype=np.uint64)
     return frames
@@ -91,10 +96,17 @@ def _merged(*parts: np.ndarray) -> np.ndarray:
     return frames[np.argsort(frames["time_ns"], kind="stable")]
 
 
+def _off(estimates: np.ndarray, force_N: np.ndarray) -> np.ndarray:
+    """By how much each estimate is off, N, from the nearest true force of the cycles about it."""
+    about = np.lib.stride_tricks.sliding_window_view(np.pad(force_N, _LATE_CYCLES, mode="edge"), 2 * _LATE_CYCLES + 1)
+    about = about[np.clip((estimates["time_ns"] - _START_NS) // contract.CYCLE_NS, 0, len(force_N) - 1)]
+    return np.maximum(np.maximum(about.min(axis=1) - estimates["force"], estimates["force"] - about.max(axis=1)), 0.0)
+
+
 def noise(rng: np.random.Generator, seconds: float, rate: int) -> int:
     """One drive in unprotected noise; returns how many frames it had."""
-    genuine = _drive(seconds)
-    foreign = _foreign(rng, round(rate * seconds), int(genuine["time_ns"][-1]))
+    genuine, _ = _drive(seconds)
+    foreign = _foreign(rng, round(rate * seconds), _START_NS, int(genuine["time_ns"][-1]))
     foreign["length"] = rng.choice([0, 4, 7, 8, 8, 8, 8], len(foreign))
     foreign["flags"] = np.where(rng.random(len(foreign)) < 0.8, 0, rng.integers(0, 16, len(foreign)))
     _damage_all(foreign)
@@ -110,12 +122,14 @@ def noise(rng: np.random.Generator, seconds: float, rate: int) -> int:
 
 def hostile(rng: np.random.Generator, seconds: float, rate: int) -> int:
     """One drive among protected foreign frames on a bad bus; returns how many frames it had."""
-    genuine = _drive(seconds)
+    genuine, force_N = _drive(seconds)
     kept = genuine[rng.random(len(genuine)) > rng.choice([0.0, 0.01, 0.3])].copy()
     doubled = kept[rng.random(len(kept)) < 0.02].copy()
     kept["time_ns"] += np.where(rng.random(len(kept)) < 0.01, rng.integers(0, 40_000_000, len(kept)), 0)
     kept["data"] ^= np.where(rng.random(len(kept)) < 0.01, rng.integers(0, 2**63, len(kept)), 0).astype(np.uint64)
-    foreign = _foreign(rng, round(rate * seconds * rng.choice([0.01, 0.1, 1.0])), int(genuine["time_ns"][-1]))
+    span_ns = int(genuine["time_ns"][-1]) - _START_NS
+    begin_ns, end_ns = (_START_NS + round(share * span_ns) for share in rng.uniform(0.0, 0.8) + np.array((0.0, 0.2)))
+    foreign = _foreign(rng, round(0.2 * rate * seconds * rng.choice([0.01, 0.1, 1.0])), begin_ns, end_ns)
     statuses = rng.choice([0, 0, 0, 1, 2, 15], len(foreign))
     _protect_all(foreign, rng.integers(0, COUNTER_MODULO + 1, len(foreign)), statuses)
     frames = _merged(kept, doubled, foreign)
@@ -126,15 +140,17 @@ def hostile(rng: np.random.Generator, seconds: float, rate: int) -> int:
         heard, rounding = np.isfinite(values[: len(known)]), 0.5 * known["factor"]
         within = (values[: len(known)] >= known["low"] - rounding) & (values[: len(known)] <= known["high"] + rounding)
         assert np.all(within | ~heard), slot
-    used = estimates[(estimates["mode"] != contract.FAULT) & (estimates["mode"] != contract.INIT)]
+    usable = (estimates["mode"] != contract.FAULT) & (estimates["mode"] != contract.INIT)
+    used = estimates[usable]
+    assert len(used) > 0.1 * len(estimates), "hardly anything could be used"
     assert np.all(np.isfinite(used["force"])) and np.all(used["sigma"] > 0.0) and np.all(used["force"] >= 0.0)
     assert np.all(used["source"] != contract.INVALID)
+    assert np.mean(_off(used, force_N) > 3.0 * used["sigma"]) < _BEYOND
     samples = estimates[estimates["is_sample"]]
     assert np.all(np.diff(samples["cycle"]) >= 1), "a cycle was answered twice"
     forces = sent[sent["can_id"] == 0x200]
     assert _wrongly_protected(sent) == 0 and len(forces) == len(estimates)
     assert np.array_equal(counter_of(forces["data"]), np.arange(len(forces)) % COUNTER_MODULO)
-    usable = (estimates["mode"] != contract.FAULT) & (estimates["mode"] != contract.INIT)
     assert np.array_equal(status_of(forces["data"]) <= contract.STATUS_DEGRADED, usable)
     return len(frames)
 
