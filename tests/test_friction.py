@@ -87,10 +87,26 @@ def test_friction_turns_over_with_the_motor_and_not_with_an_angle_that_is_late(p
     assert np.abs(left[time > 5.0]).max() < 0.05
 
 
+@pytest.mark.parametrize("delay_s", [0.006, -0.006])
+def test_a_delay_is_undone_while_the_speed_changes(parameters, delay_s):
+    """Five strokes a second: what the speed gains in 6 ms is a tenth of what the angle, or the force, is late by."""
+    p, time = brake.ideal(parameters), 0.004 * np.arange(750)
+    rows, _ = brake.samples(p, 0.5 * (p["clearance"] + 9.0) * (1.0 - np.cos(30.0 * np.maximum(time - 0.1, 0.0))))
+    expected = run_paths(rows, p)["force"]
+    if delay_s > 0.0:
+        rows["angle"] = np.interp(time - delay_s, time, rows["angle"])
+    else:
+        expected = np.interp(time + delay_s, time, expected)
+    unknown = rmse(run_paths(rows, p)["force"] - expected)
+    p["effects"]["signal_delay"]["delay_s"] = delay_s
+    assert rmse(run_paths(rows, p)["force"] - expected) < 0.02 * unknown
+
+
 @pytest.mark.parametrize(("effect", "amplitude"), [("cogging_torque", "cosine_Nm"), ("gear_mesh_ripple", "cosine")])
 def test_a_ripple_is_where_the_motor_is_and_not_where_a_late_angle_has_it(parameters, effect, amplitude):
     """At 40 rad/s an angle of 6 ms is two thirds of a turn of order 18 behind."""
     p, time = brake.ideal(parameters), 0.004 * np.arange(1500)
+    p["load_friction"] = p["offset_friction"] = 0.0
     rows, _ = brake.samples(p, 12.0 - 4.0 * np.cos(10.0 * time))
     p["effects"][effect][amplitude], p["effects"][effect]["order_per_turn"] = 0.02, 18.0
     expected = run_paths(rows, p)["torque"] / run_paths(rows, p)["leverage"]

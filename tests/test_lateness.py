@@ -76,8 +76,8 @@ def test_what_the_motor_has_turned_since_is_the_way_of_its_speeds(age, apart):
         remember(w, speed(now), apart if number else 0.0)
         if now > 0.1 + abs(age):
             way = angle(now) - angle(now - abs(age))
-            # Speed times age would be off by half of what is gained in that time: 10 mrad in 5 ms.
-            assert turned_within(w, age) == pytest.approx(np.sign(age) * way, abs=(apart * 9.0) ** 2 * 90.0 / 12.0 * abs(age))
+            # Between two samples the speed is off its chord by an eighth of the curvature at most.
+            assert turned_within(w, age) == pytest.approx(np.sign(age) * way, abs=(apart * 9.0) ** 2 * 90.0 / 8.0 * abs(age))
 
 
 def test_no_age_is_no_way_and_before_the_first_speeds_the_motor_turned_at_those():
