@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.estimator import paths
 from emb_daemon.estimator.records import new_state
 from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, turned_back
@@ -102,13 +103,20 @@ def test_a_delay_is_undone_while_the_speed_changes(parameters, delay_s):
     assert rmse(run_paths(rows, p)["force"] - expected) < 0.02 * unknown
 
 
-@pytest.mark.parametrize(("effect", "amplitude"), [("cogging_torque", "cosine_Nm"), ("gear_mesh_ripple", "cosine")])
+@pytest.mark.parametrize(("effect", "amplitude"), [("cogging_torque", "cosine_Nm"), ("gear_mesh_ripple", "cosine"), ("", "")])
 def test_a_ripple_is_where_the_motor_is_and_not_where_a_late_angle_has_it(parameters, effect, amplitude):
     """At 40 rad/s an angle of 6 ms is two thirds of a turn of order 18 behind."""
     p, time = brake.ideal(parameters), 0.004 * np.arange(1500)
     p["load_friction"] = p["offset_friction"] = 0.0
     rows, _ = brake.samples(p, 12.0 - 4.0 * np.cos(10.0 * time))
-    p["effects"][effect][amplitude], p["effects"][effect]["order_per_turn"] = 0.02, 18.0
+    if effect:
+        p["effects"][effect][amplitude], p["effects"][effect]["order_per_turn"] = 0.02, 18.0
+    else:
+        ripple = Term(
+            name="term:x", port="torque", signal="motor_angle", shape="harmonic", coefficient=0.02, scale=1.0 / 18.0,
+            low=-50.0, high=50.0,
+        )  # fmt: skip
+        fill_terms(p["effects"]["terms"], (ripple,))
     expected = run_paths(rows, p)["torque"] / run_paths(rows, p)["leverage"]
     rows["angle"] = np.interp(time - 0.006, time, rows["angle"])
 
