@@ -244,6 +244,21 @@ def test_wheel_angle_goes_on_between_pulses_and_over_the_counter_s_end():
     assert np.ptp(error[1000:]) < speed * 0.010 + pulse
 
 
+def test_the_angle_of_a_fast_wheel_is_not_behind_that_of_a_slow_one():
+    """Counts come between samples: taken for those of the sample, they are half a cycle old."""
+    time, behind = DT * np.arange(15000), []
+    for speed in (10.0, 50.0):
+        samples = np.zeros(len(time), SAMPLE)
+        samples["dt"] = np.diff(time, prepend=0.0)
+        # Messages and samples have no common clock.
+        sent = np.floor(time / 0.0103) * 0.0103
+        samples["wheel_pulse"] = np.floor(speed * sent * 96.0 / (2.0 * np.pi)) % 4096
+        samples["wheel_speed"] = speed
+        samples["has_wheel_pulse"] = samples["has_wheel_speed"] = True
+        behind.append(np.mean((speed * time - wheel_angle(samples))[1000:]))
+    assert abs(behind[1] - behind[0]) < 40.0 * 0.0005
+
+
 def test_hot_disc_brings_contact_earlier_and_wear_brings_it_later():
     samples = drive(wheel_speed=50.0)
     plain = force(bare(), samples)

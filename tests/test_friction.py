@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.estimator import paths
 from emb_daemon.estimator.records import new_state
 from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, turned_back
@@ -58,19 +59,74 @@ def test_standstill_forgets_and_sliding_knows():
     assert standing[-1] == pytest.approx(0.3, rel=0.01)
 
 
-def test_friction_turns_over_with_the_motor_and_not_with_an_angle_that_is_known_to_be_late(parameters):
-    """To and fro within half a second; at rest the noise of the speed turns nothing over."""
+def _frictions(rows, p, late_s):
+    """Mean friction state of each cycle, with an angle of which the estimator has found that it is ``late_s`` old."""
+    s, means = new_state()[0], np.empty(len(rows))
+    s["late"], s["gear_zero"], s["contact_angle"] = late_s, rows[0]["angle"], rows[0]["angle"] + p["clearance"]
+    paths.settle_paths(s, p, rows[0], 1.0)
+    for number, m in enumerate(rows):
+        paths.stiffness_path(s, p, m, 1.0)
+        paths.torque_path(s, p, m)
+        means[number], s["angle"], s["speed"] = s["friction_mean"], m["angle"], m["speed"]
+    return means
+
+
+@pytest.mark.parametrize("found", [False, True])
+def test_friction_turns_over_with_the_motor_and_not_with_an_angle_that_is_late(parameters, found):
+    """To and fro within half a second, by an age that the calibration states or the estimator has found; at rest the noise of
+    the speed turns nothing over."""
     p, time = brake.ideal(parameters), 0.004 * np.arange(2000)
     stroke = np.clip(time, 0.0, 5.0) * 4.0 * np.pi
     rows, _ = brake.samples(p, 8.0 - 3.0 * np.cos(stroke))
     expected = run_paths(rows, p)["friction_mean"]
     rows["angle"] = np.interp(time - 0.004, time, rows["angle"])
     rows["speed"] += np.random.default_rng(0).normal(0.0, 0.3, len(rows))
-    unknown = run_paths(rows, p)["friction_mean"] - expected
-    p["effects"]["signal_delay"]["delay_s"] = 0.004
-    left = run_paths(rows, p)["friction_mean"] - expected
+    unknown = _frictions(rows, p, 0.0) - expected
+    p["effects"]["signal_delay"]["delay_s"] = 0.0 if found else 0.004
+    left = _frictions(rows, p, 0.004 if found else 0.0) - expected
     assert rmse(left) < 0.5 * rmse(unknown)
     assert np.abs(left[time > 5.0]).max() < 0.05
+
+
+@pytest.mark.parametrize("delay_s", [0.006, -0.006])
+def test_a_delay_is_undone_while_the_speed_changes(parameters, delay_s):
+    """Five strokes a second: what the speed gains in 6 ms is a tenth of what the angle, or the force, is late by."""
+    p, time = brake.ideal(parameters), 0.004 * np.arange(750)
+    rows, _ = brake.samples(p, 0.5 * (p["clearance"] + 9.0) * (1.0 - np.cos(30.0 * np.maximum(time - 0.1, 0.0))))
+    expected = run_paths(rows, p)["force"]
+    if delay_s > 0.0:
+        rows["angle"] = np.interp(time - delay_s, time, rows["angle"])
+    else:
+        expected = np.interp(time + delay_s, time, expected)
+    unknown = rmse(run_paths(rows, p)["force"] - expected)
+    p["effects"]["signal_delay"]["delay_s"] = delay_s
+    assert rmse(run_paths(rows, p)["force"] - expected) < 0.02 * unknown
+
+
+@pytest.mark.parametrize(("effect", "amplitude"), [("cogging_torque", "cosine_Nm"), ("gear_mesh_ripple", "cosine"), ("", "")])
+def test_a_ripple_is_where_the_motor_is_and_not_where_a_late_angle_has_it(parameters, effect, amplitude):
+    """At 40 rad/s an angle of 6 ms is two thirds of a turn of order 18 behind."""
+    p, time = brake.ideal(parameters), 0.004 * np.arange(1500)
+    p["load_friction"] = p["offset_friction"] = 0.0
+    rows, _ = brake.samples(p, 12.0 - 4.0 * np.cos(10.0 * time))
+    if effect:
+        p["effects"][effect][amplitude], p["effects"][effect]["order_per_turn"] = 0.02, 18.0
+    else:
+        ripple = Term(
+            name="term:x", port="torque", signal="motor_angle", shape="harmonic", coefficient=0.02, scale=1.0 / 18.0,
+            low=-50.0, high=50.0,
+        )  # fmt: skip
+        fill_terms(p["effects"]["terms"], (ripple,))
+    expected = run_paths(rows, p)["torque"] / run_paths(rows, p)["leverage"]
+    rows["angle"] = np.interp(time - 0.006, time, rows["angle"])
+
+    def apart():
+        found = run_paths(rows, p)
+        return rmse((found["torque"] / found["leverage"] - expected)[10:])
+
+    unknown = apart()
+    p["effects"]["signal_delay"]["delay_s"] = 0.006
+    assert apart() < 0.1 * unknown
 
 
 def test_the_torque_balance_claims_little_at_standstill(parameters):

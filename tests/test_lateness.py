@@ -11,7 +11,18 @@ from emb_daemon.estimator.contact import follow_zero
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.estimator.status import ANGLE_LATE
-from emb_daemon.models.lateness import LATENESS, SLOWEST_S, find_filter, follow, interrupt, stand, unfilter
+from emb_daemon.models.lateness import (
+    LATELY,
+    LATENESS,
+    SLOWEST_S,
+    find_filter,
+    follow,
+    interrupt,
+    remember,
+    stand,
+    turned_within,
+    unfilter,
+)
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import OUT_OF_RANGE, PATHS_DISAGREE
@@ -53,6 +64,32 @@ def test_the_age_is_found_whatever_the_gain(late_s, gain):
 @pytest.mark.parametrize("gain", [0.93, 1.0, 1.07])
 def test_an_angle_in_time_is_not_old(gain):
     assert _age(gain=gain) < 2e-4
+
+
+@pytest.mark.parametrize("age", [-0.05, -0.006, 0.001, 0.004, 0.006, 0.05])
+@pytest.mark.parametrize("apart", [_DT, 0.01])
+def test_what_the_motor_has_turned_since_is_the_way_of_its_speeds(age, apart):
+    angle, speed = _strokes()
+    w = np.zeros(1, LATELY)[0]
+    for number in range(100):
+        now = 0.1 + apart * number
+        remember(w, speed(now), apart if number else 0.0)
+        if now > 0.1 + abs(age):
+            way = angle(now) - angle(now - abs(age))
+            # Between two samples the speed is off its chord by an eighth of the curvature at most.
+            assert turned_within(w, age) == pytest.approx(np.sign(age) * way, abs=(apart * 9.0) ** 2 * 90.0 / 8.0 * abs(age))
+
+
+def test_no_age_is_no_way_and_before_the_first_speeds_the_motor_turned_at_those():
+    w = np.zeros(1, LATELY)[0]
+    assert turned_within(w, 0.01) == 0.0
+    for speed in np.linspace(10.0, 40.0, 31):
+        remember(w, speed, 0.001)
+        assert turned_within(w, 0.0) == 0.0
+    # Thirteen ways, from 27 to 40 rad/s, and 27 rad/s before.
+    assert turned_within(w, 0.05) == pytest.approx(0.013 * 33.5 + 0.037 * 27.0)
+    remember(w, 7.0, 0.0)
+    assert turned_within(w, -0.002) == pytest.approx(-0.014)
 
 
 def test_an_older_speed_says_nothing_of_the_angle():

@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.model import Model
 from emb_daemon.effects.base import Effect
+from emb_daemon.effects.paths import known_delay
 
 #: Bins of motor angle in one period of the highest order of an octave.
 _BINS = 8
@@ -16,7 +18,10 @@ def strongest_orders(
     orders were looked at. ``most`` of them are returned, because logs at distant angles have side lobes nearly as strong as
     the peak."""
     samples = np.concatenate([trial.log.samples for trial in model.bench.trials])
-    angle, travel = samples["angle"], np.abs(samples["speed"]) * samples["dt"]
+    travel = np.abs(samples["speed"]) * samples["dt"]
+    # A ripple is where the motor is, and not where a late angle has it.
+    late = known_delay(to_parameters(model.bench.calibrated(model.values))["effects"])
+    angle = samples["angle"] + late * samples["speed"]
     harmonic, limits = effect.harmonic, effect.parameter(effect.harmonic.order).starts
     if harmonic.whole:
         orders = np.arange(limits[0], limits[1] + 0.5)

@@ -33,7 +33,7 @@ class Hook:
     like: str | None = None
 
 
-_GEAR = ("m", "travel", "mean_speed", "friction_mean", "past_contact", "force", "dt")
+_GEAR = ("angle", "travel", "mean_speed", "friction_mean", "past_contact", "force", "dt")
 
 #: By name, in the order in which a sample passes through them.
 HOOKS = {
@@ -41,8 +41,8 @@ HOOKS = {
     "thickness": Hook(
         "m", 0.0, ("m", "disc", "disc_known", "power", "dt"), "stiffness", "stiffness", "contact.clearance_rad"
     ),
-    # Angle by which the spindle is ahead of the measured motor angle.
-    "motor_angle": Hook("rad", 0.0, ("m", "dt"), "stiffness", "stiffness", "contact.clearance_rad"),
+    # Angle by which the spindle is ahead of the measured motor angle; ``lately`` the last speeds (`models.lateness.LATELY`).
+    "motor_angle": Hook("rad", 0.0, ("m", "lately", "dt"), "stiffness", "stiffness", "contact.clearance_rad"),
     # Factor on the static clamp force, after ``travel`` rad in contact.
     "stiffness": Hook("1", 1.0, ("travel", "dt"), "stiffness", "stiffness"),
     # Static clamp force.
@@ -55,8 +55,8 @@ HOOKS = {
     ),
     # Current of the motor.
     "current": Hook("A", None, ("m", "dt"), "torque", "torque"),
-    # Motor torque that reaches the gear.
-    "torque": Hook("N·m", None, ("m", "travel", "mean_speed", "dt"), "torque", "torque"),
+    # Motor torque that reaches the gear; ``angle`` of the motor at the end of the cycle, rad, in which it went ``travel`` rad.
+    "torque": Hook("N·m", None, ("angle", "travel", "mean_speed", "dt"), "torque", "torque"),
     # Factors on the gear gain and on gear friction; ``friction_mean`` in [-1, 1] is the friction state, positive while
     # clamping, ``past_contact`` the motor angle past contact, rad.
     "gear_gain": Hook("1", 1.0, _GEAR, "torque", "torque"),

@@ -6,11 +6,11 @@ from emb_daemon.jit import Record, njit
 
 
 @njit
-def term(p: Record, m: Record, travel: float) -> float:
+def term(p: Record, angle: float, travel: float) -> float:
     """Torque in N m that it adds, mean over the cycle."""
     if p.cosine_Nm == 0.0 and p.sine_Nm == 0.0:
         return 0.0
-    return -cycle_mean(p.cosine_Nm, p.sine_Nm, p.order_per_turn, m.angle, travel)
+    return -cycle_mean(p.cosine_Nm, p.sine_Nm, p.order_per_turn, angle, travel)
 
 
 def _between_teeth(order: float) -> tuple[float, ...]:

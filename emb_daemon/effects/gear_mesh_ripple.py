@@ -16,11 +16,11 @@ def cycle_mean(cosine: float, sine: float, order: float, angle: float, travel: f
 
 
 @njit
-def term(p: Record, m: Record, travel: float) -> float:
+def term(p: Record, angle: float, travel: float) -> float:
     """Gear gain over its mean, minus one, mean over the cycle."""
     if p.cosine == 0.0 and p.sine == 0.0:
         return 0.0
-    return cycle_mean(p.cosine, p.sine, p.order_per_turn, m.angle, travel)
+    return cycle_mean(p.cosine, p.sine, p.order_per_turn, angle, travel)
 
 
 def _off(order: float) -> tuple[float, ...]:

@@ -84,11 +84,12 @@ def static_force(e: Record, s: Record, static: float, travel: float, dt: float) 
 
 @njit
 def motor_torque(
-    e: Record, s: Record, m: Record, nominal: float, travel: float, mean_speed: float, disc: float, disc_known: bool
-) -> float:
+    e: Record, s: Record, m: Record, nominal: float, angle: float, travel: float, mean_speed: float, disc: float,
+    disc_known: bool,
+) -> float:  # fmt: skip
     """Motor torque (N m) that reaches the gear; ``nominal`` is the torque constant at 25 degC."""
     constant = nominal * torque_constant(e, s, m, disc, disc_known, m.dt)
-    return torque(constant * current(m.current_q, e, s, m, m.dt), e, s, m, travel, mean_speed, m.dt)
+    return torque(constant * current(m.current_q, e, s, m, m.dt), e, s, angle, travel, mean_speed, m.dt)
 
 
 @njit

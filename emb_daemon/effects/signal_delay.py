@@ -2,22 +2,22 @@
 
 from emb_daemon.effects.base import Effect, Parameter
 from emb_daemon.jit import Record, njit
+from emb_daemon.models.lateness import turned_within
 
 
 @njit
-def term(p: Record, m: Record) -> float:
+def term(p: Record, lately: Record) -> float:
     """Angle in rad by which the motor has gone on."""
-    return p.delay_s * m.speed
+    return turned_within(lately, p.delay_s)
 
 
 EFFECT = Effect(
     name="signal_delay",
     hook="motor_angle",
     term=term,
-    # First-order correction: good for fifty milliseconds of a slow stroke, and for a cycle and a half of a fast one.
     parameters=(Parameter("delay_s", "s", -0.05, 0.05, 0.001, "age of the angle", drawn=(0.0, 0.006)),),
-    equation="θ → θ + d ω",
-    source="first-order hold of a delayed sample",
+    equation="θ → θ + ∫ ω over the last d",
+    source="dead reckoning of a delayed sample by its speed",
     signal="motor_speed",
     manoeuvre="fast and slow strokes over the same forces: a delay grows with motor speed, a relaxation does not",
 )

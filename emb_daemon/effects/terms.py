@@ -92,9 +92,8 @@ STATE = np.dtype(
 @njit
 def _follow(signal, s, m):
     """Signals at this sample, before the force is known: the last one, moved along the curve."""
-    turned = m.angle - s.angle
-    signal[_ANGLE], signal[_TRAVEL], signal[_SPEED] = m.angle, max(s.past_contact + turned, 0.0), m.speed
-    force = max(s.force + s.slope * turned, 0.0)
+    signal[_ANGLE], signal[_TRAVEL], signal[_SPEED] = m.angle + s.ahead, max(s.past_contact + s.travel, 0.0), m.speed
+    force = max(s.force + s.slope * s.travel, 0.0)
     signal[_FORCE], signal[_RATE] = force, s.slope * m.speed
     signal[_CURRENT] = m.current_q if m.has_current else np.nan
     signal[_PADS] = 0.5 * (s.mean[0] + s.mean[1]) if s.temperature_known else np.nan

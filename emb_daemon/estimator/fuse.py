@@ -154,7 +154,7 @@ def _spread(s, p, m):
     relative = hypot(relative, s.effects.terms.sigma)
     relative = hypot(relative, s.slope * effects.thickness_sigma(s.effects) / p.gear_gain)
     if s.late > 0.0 and m.dt > 0.0:
-        # A late angle is corrected to first order; the second order is the change of speed meanwhile.
+        # Whether the speed beside a late angle is of its moment or of an earlier one nobody knows: it gained this meanwhile.
         relative = hypot(relative, 0.5 * s.late * s.late * s.slope * s.gear_slope * (m.speed - s.speed) / m.dt)
     return sqrt(p.stiffness_sigma * p.stiffness_sigma + relative * relative)
 

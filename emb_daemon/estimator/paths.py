@@ -8,9 +8,9 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
+from emb_daemon.models.lateness import remember, turned_within
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
 from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, slid_angle, turned_back, unexplained_torque
-from emb_daemon.models.wander import STANDING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Time between two samples up to which none is missing, s.
@@ -19,6 +19,8 @@ ONE_CYCLE_S = 1.5 * CYCLE_S
 DISSOLVING_PER_S = 0.05
 #: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
 _SELF_LOCKING = 0.2
+#: Standard deviations of the way that noisy speeds add up to from which it is one.
+_CERTAINLY = 3.0
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
@@ -41,11 +43,15 @@ def turned(s: Record, p: Record, angle: float) -> tuple[float, float]:
 @njit
 def position(s: Record, p: Record, m: Record) -> float:
     """Equivalent angle past contact at this sample, rad; advances the effects that act on it."""
-    e, state = p.effects, s.effects
+    e, state, before = p.effects, s.effects, s.angle + s.ahead
+    remember(s.lately, m.speed, m.dt)
+    s.ahead = turned_within(s.lately, s.late + effects.known_delay(e))
+    s.travel = m.angle + s.ahead - before
     effects.look(e.terms, s, p, m)
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
     grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
-    angle, s.gear_slope = turned(s, p, m.angle + s.late * m.speed + effects.motor_angle(e, state, m, m.dt))
+    late = turned_within(s.lately, s.late)
+    angle, s.gear_slope = turned(s, p, m.angle + late + effects.motor_angle(e, state, m, s.lately, m.dt))
     return angle + gained / p.gear_gain + grown - s.contact_angle
 
 
@@ -169,25 +175,27 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);
     the torque is NaN where it says nothing.
     """
-    travel = m.angle - s.angle
     # Friction turns over with the motor, not with an angle that is late; the noise of its speed at rest is no motion.
-    turning = m.speed - min(max(m.speed, -STANDING_RAD_PER_S), STANDING_RAD_PER_S)
-    slid = _slid(s, p, m.angle + effects.known_delay(p.effects) * turning, travel, m.dt)
+    noise = _CERTAINLY * p.speed_sigma * sqrt(CYCLE_S * abs(s.late + effects.known_delay(p.effects)))
+    turning = s.ahead - min(max(s.ahead, -noise), noise)
+    slid = _slid(s, p, m.angle + turning, m.angle - s.angle, m.dt)
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
     s.friction_mean = mean
-    e, state, mean_speed = p.effects, s.effects, 0.5 * (m.speed + s.speed)
-    s.gear_gain = effects.gear_gain(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
-    s.gear_friction = effects.gear_friction(e, state, m, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    e, state, mean_speed, angle, travel = p.effects, s.effects, 0.5 * (m.speed + s.speed), m.angle + s.ahead, s.travel
+    s.gear_gain = effects.gear_gain(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    s.gear_friction = effects.gear_friction(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     s.motor_torque = p.torque_constant * m.current_q
     # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
-    middle, slope = turned(s, p, m.angle - 0.5 * travel)
+    middle, slope = turned(s, p, angle - 0.5 * travel)
     s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
     leverage = (p.gear_gain * s.gear_gain + p.load_friction * s.gear_friction * mean) * slope
     if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain * slope:
         return np.nan, leverage, 1.0
-    s.motor_torque = effects.motor_torque(e, state, m, p.torque_constant, travel, mean_speed, s.disc, s.temperature_known)
+    s.motor_torque = effects.motor_torque(
+        e, state, m, p.torque_constant, angle, travel, mean_speed, s.disc, s.temperature_known
+    )
     offset_friction = p.offset_friction * s.gear_friction
     torque = unexplained_torque(s.motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
     turning = p.presliding_sigma * (1.0 - mean * mean)

@@ -15,7 +15,7 @@ from emb_daemon.models.alignment import ALIGNMENT
 from emb_daemon.models.contact import CONTACT
 from emb_daemon.models.fusion import CREEPS, STATES
 from emb_daemon.models.gear import GEAR
-from emb_daemon.models.lateness import LATENESS
+from emb_daemon.models.lateness import LATELY, LATENESS
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
 from emb_daemon.models.wander import WANDER
@@ -123,6 +123,9 @@ STATE = np.dtype(
         # Age of the angle beside the speed, and beyond what the calibration knows, s.
         ("lateness", LATENESS),
         ("late", "f8"),
+        # The motor's speeds of late; way (rad) that it has gone on since its angle was taken, and since the last sample.
+        ("lately", LATELY),
+        *fields("f8", "ahead travel"),
         ("alignment", ALIGNMENT),
         ("wander", WANDER),
         # Fusion.
