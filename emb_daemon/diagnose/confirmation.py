@@ -176,7 +176,8 @@ def _where_worse(selection: Selection, channel: str, before: np.ndarray, after: 
 def _fits_without(selection: Selection, without: str) -> Iterator[tuple[np.ndarray, dict[Coordinate, float]]]:
     """Each quarter of the episodes as a mask, shape (episodes,), with the parameters that the other quarters give."""
     bench = selection.model.bench
-    fold = np.arange(bench.episodes) % _FOLDS
+    # Drawn, since a manoeuvre that is repeated would have one of its phases in a part of its own.
+    fold = np.random.default_rng(0).permutation(np.arange(bench.episodes) % _FOLDS)
     for number in range(_FOLDS):
         values = selection.applied(without)
         for channel in bench.channels:
@@ -213,18 +214,9 @@ def refit(selection: Selection, channel: str, kept: np.ndarray, without: str = "
     linear = [c for c in model.own(channel) if not is_shape(c)]
     if channel == without or not linear or channel not in selection.touched:
         return {}
-    table = np.column_stack([model.columns[c] for c in linear])
-    centre = np.array([model.centre.get(c, c.start) for c in linear])
-    restored = model.residual_at(channel, dict(zip(linear, centre, strict=True)))
-    free = np.array([c.effect != without or not without for c in linear])
-    moments = Moments.of(table[:, free], restored, model.bench.episode[channel], model.bench.episodes)
-    penalty = model.penalty([c for c, use in zip(linear, free, strict=True) if use], channel)
-    found = leave_out(Moments(moments.products[kept], moments.counts[kept]), penalty).values
-    moved = centre.copy()
-    moved[free] += found
-    return {
-        c: float(np.clip(value, c.low, c.high)) for c, value, use in zip(linear, moved, free, strict=True) if use
-    }  # fmt: skip
+    centre = {c: model.centre.get(c, c.start) for c in linear}
+    free = [c for c in linear if c.effect != without or not without]
+    return model.solved(free, centre, kept)
 
 
 def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, tolerated: float = HARM) -> str:

@@ -114,6 +114,19 @@ def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
     return LeftOut(values, covariance, left_out, without)
 
 
+def solve_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Penalised least squares within bounds, shape (columns,), as those of a fit: what one value must not take the others do
+    otherwise."""
+    from scipy.optimize import lsq_linear
+
+    total = moments.products.sum(axis=0)
+    size = np.diag(total)[:-1]
+    scale = np.sqrt(np.where(size > 0.0, size, 1.0))
+    root = np.linalg.cholesky(total[:-1, :-1] / np.outer(scale, scale) + np.diag(penalty / scale**2 + 1e-10)).T
+    right = np.linalg.solve(root.T, total[:-1, -1] / scale)
+    return lsq_linear(root, right, (scale * low, scale * high), "bvls").x / scale
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the episodes say of a candidate.

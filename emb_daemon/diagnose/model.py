@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
-from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out
+from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out, solve_within
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
@@ -79,6 +79,11 @@ class Model:
     def own(self, channel: str) -> list[Coordinate]:
         """What is fitted in a channel."""
         return [c for c in self.values if c.channel == channel and c not in self.chosen]
+
+    def movable(self, channel: str) -> list[Coordinate]:
+        """What no bound holds of that: what the others do a line must not put down to one that cannot go on, as a drag that
+        drives or an offset of the load, which is a friction below zero where a motor turns one way."""
+        return [c for c in self.own(channel) if not c.is_held(self.values[c])]
 
     def of_effect(self, name: str) -> list[Coordinate]:
         return [c for c in self.values if c.effect == name]
@@ -213,16 +218,15 @@ class Model:
 
     def residual_at(self, channel: str, elsewhere: Values) -> np.ndarray:
         """A channel's residual with some of its coordinates elsewhere, by their regressors."""
-        back = np.array([self.values[c] - value for c, value in elsewhere.items()])
-        return self.residual[channel] + np.column_stack([self.columns[c] for c in elsewhere]) @ back
+        return self.residual[channel] + sum(self.columns[c] * (self.values[c] - value) for c, value in elsewhere.items())
 
     def left_out(
         self, channel: str, free: Sequence[Coordinate] | None = None, residual: np.ndarray | None = None, samples: int = 1
     ) -> np.ndarray:
         """Squared error of the channel's residual, or another, over each episode by a fit to the others, shape (episodes,).
 
-        ``free``: coordinates that are fitted, all in the channel if none are given; ``samples``: in a mean."""
-        free = self.own(channel) if free is None else free
+        ``free``: coordinates that are fitted, all that can move if none are given; ``samples``: in a mean."""
+        free = self.movable(channel) if free is None else free
         moments = self.moments(channel, [self.columns[c] for c in free], residual, samples)
         return leave_out(moments, self.penalty(free, channel)).left_out
 
@@ -230,7 +234,7 @@ class Model:
         self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = (), samples: int = 1
     ) -> Evidence:
         """Of regressors that are not in the model, everything in it and ``given`` ones free; of means over ``samples``."""
-        free = self.own(channel)
+        free = self.movable(channel)
         moments = self.moments(channel, [*(self.columns[c] for c in free), *given, *own], samples=samples)
         penalty = np.concatenate([self.penalty(free, channel), np.zeros(len(given) + len(own))])
         first = len(free) + len(given)
@@ -240,14 +244,29 @@ class Model:
         """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free; of means over
         ``samples``.
 
-        An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do."""
+        An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do. What a bound
+        would hold then stands there."""
         tested = list(values)
         channel, effects = tested[0].channel, {c.effect for c in tested if c.effect}
-        free = [c for c in self.own(channel) if c in values or c.effect not in effects or not is_shape(c)]
-        restored = self.residual_at(channel, {c: values.get(c, self.centre.get(c, c.start)) for c in free})
-        moments = self.moments(channel, [self.columns[c] for c in free], restored, samples)
-        rest = [index for index, c in enumerate(free) if c not in values]
-        return judge(moments, rest, [free.index(c) for c in tested], self.penalty(free, channel))
+        there = [c for c in self.own(channel) if c not in values and (c.effect not in effects or not is_shape(c))]
+        elsewhere = {c: self.centre.get(c, c.start) for c in there} | dict(values)
+        without = self.solved(there, elsewhere)
+        rest = [c for c in there if not c.is_held(without[c])]
+        restored = self.residual_at(channel, elsewhere | {c: without[c] for c in there if c not in rest})
+        moments = self.moments(channel, [self.columns[c] for c in (*rest, *tested)], restored, samples)
+        first, every = len(rest), self.penalty([*rest, *tested], channel)
+        return judge(moments, list(range(first)), list(range(first, len(every))), every)
+
+    def solved(self, free: Sequence[Coordinate], at: Values, kept: np.ndarray | None = None) -> dict[Coordinate, float]:
+        """What some coordinates of a channel come to within their bounds, by their regressors about their centres, with these
+        and others elsewhere ``at``; of the episodes that are ``kept``, shape (episodes,), or of all."""
+        if not free:
+            return {}
+        channel, kept = free[0].channel, slice(None) if kept is None else kept
+        moments = self.moments(channel, [self.columns[c] for c in free], self.residual_at(channel, at))
+        low, high = np.array([(c.low - at[c], c.high - at[c]) for c in free]).T
+        moved = solve_within(Moments(moments.products[kept], moments.counts[kept]), self.penalty(free, channel), low, high)
+        return {c: float(at[c] + by) for c, by in zip(free, moved, strict=True)}
 
     def counted(self, channel: str) -> int:
         """Residuals of a channel that say something."""

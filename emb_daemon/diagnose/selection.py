@@ -179,7 +179,7 @@ def find_recalibrated(selection: Selection, start: Model, channels: Iterable[str
 def recalibration_gain(model: Model, start: Model, channel: str) -> float:
     """RMS that refitting a channel's base parameters takes on left-out episodes from what it leaves at the ``start``."""
     # About where the fit ended: the line that touches the start does not lead there where friction turns over at once.
-    restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in model.own(channel)})
+    restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in model.movable(channel)})
     left_out = model.left_out(channel, residual=restored)
     before = float(start.residual[channel] @ start.residual[channel])
     return model.rms(before - float(left_out.sum()), channel)
