@@ -14,7 +14,7 @@ import numpy as np
 
 from emb_daemon.diagnose.comparison import by_log, episodes_by_log, errors, errors_of, whole
 from emb_daemon.diagnose.coordinates import Coordinate
-from emb_daemon.diagnose.evidence import Moments, leave_out
+from emb_daemon.diagnose.evidence import Moments, leave_out, solve_within
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import Q_VALUE
@@ -216,7 +216,12 @@ def refit(selection: Selection, channel: str, kept: np.ndarray, without: str = "
         return {}
     centre = {c: model.centre.get(c, c.start) for c in linear}
     free = [c for c in linear if c.effect != without or not without]
-    return model.solved(free, centre, kept)
+    if not free:
+        return {}
+    moments = model.moments(channel, [model.columns[c] for c in free], model.residual_at(channel, centre))
+    low, high = np.array([(c.low - centre[c], c.high - centre[c]) for c in free]).T
+    moved = solve_within(Moments(moments.products[kept], moments.counts[kept]), model.penalty(free, channel), low, high)
+    return {c: float(centre[c] + by) for c, by in zip(free, moved, strict=True)}
 
 
 def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, tolerated: float = HARM) -> str:

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
-from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out, solve_within
+from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
@@ -244,29 +244,14 @@ class Model:
         """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free; of means over
         ``samples``.
 
-        An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do. What a bound
-        would hold then stands there."""
+        An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do."""
         tested = list(values)
         channel, effects = tested[0].channel, {c.effect for c in tested if c.effect}
-        there = [c for c in self.own(channel) if c not in values and (c.effect not in effects or not is_shape(c))]
-        elsewhere = {c: self.centre.get(c, c.start) for c in there} | dict(values)
-        without = self.solved(there, elsewhere)
-        rest = [c for c in there if not c.is_held(without[c])]
-        restored = self.residual_at(channel, elsewhere | {c: without[c] for c in there if c not in rest})
+        rest = [c for c in self.movable(channel) if c not in values and (c.effect not in effects or not is_shape(c))]
+        restored = self.residual_at(channel, {c: self.centre.get(c, c.start) for c in rest} | dict(values))
         moments = self.moments(channel, [self.columns[c] for c in (*rest, *tested)], restored, samples)
-        first, every = len(rest), self.penalty([*rest, *tested], channel)
-        return judge(moments, list(range(first)), list(range(first, len(every))), every)
-
-    def solved(self, free: Sequence[Coordinate], at: Values, kept: np.ndarray | None = None) -> dict[Coordinate, float]:
-        """What some coordinates of a channel come to within their bounds, by their regressors about their centres, with these
-        and others elsewhere ``at``; of the episodes that are ``kept``, shape (episodes,), or of all."""
-        if not free:
-            return {}
-        channel, kept = free[0].channel, slice(None) if kept is None else kept
-        moments = self.moments(channel, [self.columns[c] for c in free], self.residual_at(channel, at))
-        low, high = np.array([(c.low - at[c], c.high - at[c]) for c in free]).T
-        moved = solve_within(Moments(moments.products[kept], moments.counts[kept]), self.penalty(free, channel), low, high)
-        return {c: float(at[c] + by) for c, by in zip(free, moved, strict=True)}
+        first, penalty = len(rest), self.penalty([*rest, *tested], channel)
+        return judge(moments, list(range(first)), list(range(first, len(penalty))), penalty)
 
     def counted(self, channel: str) -> int:
         """Residuals of a channel that say something."""

@@ -381,6 +381,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
             lines[at[0]].count(at[1]),
         ),
     )
+    content = _under_one_header(path, content, header)
     cells = _cells(lines[header], delimiter)
     by_place = all(map(_BY_PLACE.fullmatch, names))
     if not {*names} & {*cells} and (found := _without_header(lines, by_place)):
@@ -448,6 +449,25 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         for field, unit in itertools.zip_longest(table.schema, stated[: table.num_columns], fillvalue="")
     ]
     return pyarrow.Table.from_arrays(table.columns, schema=pyarrow.schema(fields))
+
+
+def _under_one_header(path: Path, content: bytes, header: int) -> bytes:
+    """A table whose header is repeated, over each segment that LabVIEW writes or by a logger switched on again, without that
+    and the words above it."""
+    lines = content.split(b"\n")
+    again = lines[header + 1 :].count(lines[header]) if len(lines) > header else 0
+    if not again or _is_number(lines[header].decode(errors="replace").strip()):
+        return content
+    kept = lines[: header + 1]
+    for line in lines[header + 1 :]:
+        if line != lines[header]:
+            kept.append(line)
+            continue
+        above = kept[max(len(kept) - header, header + 1) :]
+        words = itertools.takewhile(lambda text: not _is_number(text.decode(errors="replace").strip(' "')), reversed(above))
+        del kept[len(kept) - len(list(words)) :]
+    print(f"{path}: the header is repeated {again} times; that and the words above it are left out", file=sys.stderr)
+    return b"\n".join(kept)
 
 
 def _are_pairs(names: list[str], rows: list[list[str]]) -> bool:
