@@ -120,11 +120,9 @@ def solve_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: n
     from scipy.optimize import lsq_linear
 
     total = moments.products.sum(axis=0)
-    size = np.diag(total)[:-1]
-    scale = np.sqrt(np.where(size > 0.0, size, 1.0))
-    root = np.linalg.cholesky(total[:-1, :-1] / np.outer(scale, scale) + np.diag(penalty / scale**2 + 1e-10)).T
-    right = np.linalg.solve(root.T, total[:-1, -1] / scale)
-    return lsq_linear(root, right, (scale * low, scale * high), "bvls").x / scale
+    ridge = np.diag(penalty + 1e-10 * np.diag(total)[:-1] + 1e-12)
+    root = np.linalg.cholesky(total[:-1, :-1] + ridge).T
+    return lsq_linear(root, np.linalg.solve(root.T, total[:-1, -1]), (low, high), "bvls").x
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
 #: A semicolon at the end of a line.
 _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
+#: Lines at the end of a text that do not begin with a number.
+_WORDS = re.compile(rb'(?:(?:^|\n)(?![ \t"]*[+-]?[\d.,]).*)+\Z')
 #: Cells that mean that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -454,20 +456,14 @@ def _text_table(path: Path, content: bytes, names: list[str]):
 def _under_one_header(path: Path, content: bytes, header: int) -> bytes:
     """A table whose header is repeated, over each segment that LabVIEW writes or by a logger switched on again, without that
     and the words above it."""
-    lines = content.split(b"\n")
-    again = lines[header + 1 :].count(lines[header]) if len(lines) > header else 0
-    if not again or _is_number(lines[header].decode(errors="replace").strip()):
+    line = content.split(b"\n", header + 1)[header]
+    over, *parts = (b"\n" + content).split(b"\n" + line + b"\n")
+    if len(parts) < 2 or not line.strip() or _is_number(line.decode(errors="replace").strip()):
         return content
-    kept = lines[: header + 1]
-    for line in lines[header + 1 :]:
-        if line != lines[header]:
-            kept.append(line)
-            continue
-        above = kept[max(len(kept) - header, header + 1) :]
-        words = itertools.takewhile(lambda text: not _is_number(text.decode(errors="replace").strip(' "')), reversed(above))
-        del kept[len(kept) - len(list(words)) :]
-    print(f"{path}: the header is repeated {again} times; that and the words above it are left out", file=sys.stderr)
-    return b"\n".join(kept)
+    told = f"the header is repeated {len(parts) - 1} times; that and the words above it are left out"
+    print(f"{path}: {told}", file=sys.stderr)
+    above = [_WORDS.sub(b"", part) if header else part for part in parts[:-1]]
+    return b"\n".join([over, line, *above, parts[-1]])[1:]
 
 
 def _are_pairs(names: list[str], rows: list[list[str]]) -> bool:
