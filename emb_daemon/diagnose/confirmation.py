@@ -211,12 +211,9 @@ def refit(selection: Selection, channel: str, kept: np.ndarray, without: str = "
     """A channel's coordinates from the episodes that are ``kept``, shape (episodes,), ``without`` one suspect; shapes, which
     are not linear, stand as fitted."""
     model = selection.model
-    linear = [c for c in model.own(channel) if not is_shape(c)]
-    if channel == without or not linear or channel not in selection.touched:
-        return {}
-    centre = {c: model.centre.get(c, c.start) for c in linear}
-    free = [c for c in linear if c.effect != without or not without]
-    if not free:
+    centre = {c: model.centre.get(c, c.start) for c in model.own(channel) if not is_shape(c)}
+    free = [c for c in centre if c.effect != without or not without]
+    if channel == without or not free or channel not in selection.touched:
         return {}
     moments = model.moments(channel, [model.columns[c] for c in free], model.residual_at(channel, centre))
     low, high = np.array([(c.low - centre[c], c.high - centre[c]) for c in free]).T
