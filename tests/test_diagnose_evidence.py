@@ -1,5 +1,7 @@
 """Evidence over episodes: what counts as one observation, and what it takes to prove something."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import f as f_distribution
 
+from emb_daemon.diagnose.confirmation import _fits_without
 from emb_daemon.diagnose.episodes import episodes
-from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out
+from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out, solve_within
 
 
 def _autocorrelated(rng, episodes_, samples):
@@ -270,3 +273,25 @@ def test_a_column_of_nothing_overflows_nothing():
     with np.errstate(all="raise"):
         found = leave_out(moments, np.array([1e12, 0.0]))
     np.testing.assert_allclose(found.values, [0.0, 2.0], atol=1e-6)
+
+
+def test_what_a_bound_holds_the_others_do_otherwise():
+    """Of two columns that nearly are one, the first may not be negative: the second alone does what both would."""
+    random = np.random.default_rng(1)
+    one = random.normal(size=600)
+    table = np.column_stack([one, one + 0.01 * random.normal(size=600)])
+    target = table @ [-3.0, 5.0] + 0.1 * random.normal(size=600)
+    moments = Moments.of(table, target, np.arange(600) // 100, 6)
+    free = solve_within(moments, np.zeros(2), np.full(2, -np.inf), np.full(2, np.inf))
+    assert free == pytest.approx(np.linalg.lstsq(table, target)[0], rel=1e-4) and free[0] < 0.0
+    held = solve_within(moments, np.zeros(2), np.array([0.0, -np.inf]), np.full(2, np.inf))
+    assert held[0] == 0.0 and held[1] == pytest.approx(table[:, 1] @ target / (table[:, 1] @ table[:, 1]), rel=1e-6)
+
+
+@pytest.mark.parametrize("phases", [2, 3, 4, 5, 8])
+def test_no_phase_of_a_manoeuvre_that_is_repeated_is_left_out_whole(phases):
+    """Run up, held, slowed down, at rest: what is fitted without one of them cannot tell it."""
+    model = SimpleNamespace(bench=SimpleNamespace(episodes=10 * phases, channels=[]))
+    parts = [own for own, _ in _fits_without(SimpleNamespace(model=model, applied=lambda without: {}), "")]
+    assert np.sum(parts, axis=0).tolist() == 10 * phases * [1]
+    assert all(part.reshape(-1, phases).mean(axis=0).max() < 0.8 for part in parts)

@@ -163,6 +163,17 @@ def _table(count: int, row: str = "{t:.3f},{a:.1f},25.0,1.5,22,0") -> str:
 
 
 _HEADER = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N"
+
+
+def _segments(rows: int) -> str:
+    """As LabVIEW writes a table, a header and how many samples it has over each few of its rows; the first has more words."""
+    lines = _table(21 * rows).splitlines(keepends=True)
+    over = f"Channels,6\nSamples,{rows}\n***End_of_Header***\n{_HEADER}\n"
+    return "A Tool\nSeparator,Comma\n***End_of_Header***\n\n" + "\n".join(
+        over + "".join(lines[n : n + rows]) for n in range(0, len(lines), rows)
+    )
+
+
 _PAIRS = _HEADER.replace(",", ",,") + ",\n"
 
 
@@ -176,7 +187,8 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (_HEADER + ",\n" + _table(100), ""),
         ("\ufeff" + _HEADER.replace(",", "\t") + "\r\n" + _table(100).replace(",", "\t").replace("\n", "\r\n"), ""),
         (_HEADER + "\n" + _table(100) + "0.400,10.0,25", "1 rows with another number of cells than 6 left out"),
-        (f"{_HEADER}\n{_table(100)}{_HEADER}\n", "1 cells are no numbers, left out, the first of them 'angle_rad'"),
+        (f"{_HEADER}\n{_table(100)}{_HEADER}\n", "the header is repeated 1 times"),
+        (_segments(5), "the header is repeated 20 times; that and the words above it are left out"),
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,#N/A") + "0.4,10,25,1.5,22,Over\n", "out, the first of"),
         ((_HEADER + "\n" + _table(100)).replace("\n", "\r"), ""),
         ((_HEADER + "\n" + _table(100)).replace(",", "|"), ""),
@@ -191,8 +203,9 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
-        "two headers", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside", "late decimal commas",
-        "quotes after blanks", "a typesetter's minus", "more names than cells", "units above an empty line",
+        "two headers", "segments", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside",
+        "late decimal commas", "quotes after blanks", "a typesetter's minus", "more names than cells",
+        "units above an empty line",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):

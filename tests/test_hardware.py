@@ -138,6 +138,24 @@ def test_a_constant_is_not_taken_for_larger_because_friction_scatters_the_load()
     assert after < 0.9 * before and after < 1.03 * np.sqrt(np.mean(left**2))
 
 
+def test_an_offset_shows_where_a_motor_turns_one_way_and_friction_cannot_be_less_than_none():
+    """There the two are one line: a friction that drives must not stand in for an offset, in a test that no fit can follow. Of
+    a propeller, whose load goes with its speed, and which is run up and slowed down time and again, four phases to a run."""
+    stated, constant, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
+
+    def log(seed: int):
+        random, time_s = np.random.default_rng(seed), 0.004 * np.arange(12_000)
+        speed = 85.0 + 55.0 * np.interp(time_s % 8.0, [0.0, 2.0, 4.0, 6.0, 8.0], [0.0, 1.0, 1.0, 0.0, 0.0])
+        current = 4.0 * (speed / 100.0) ** 2 + 0.3 * np.repeat(random.normal(size=300), 40)
+        force = constant * (current + 2.0) / stated.motor.gear_gain_m_per_rad + 20.0 * random.normal(size=len(time_s))
+        columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": current, "force_N": force}
+        return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+
+    found = diagnose([log(1)], stated, [log(2)])
+    assert [c.effect.name for c in found.accepted] == ["current_offset"]
+    assert found.after.rmse("torque") < 1.3 * 20.0 < 0.1 * found.before.rmse("torque")
+
+
 @pytest.mark.parametrize("own", ["direction", "speed", "acceleration"])
 def test_what_the_machine_takes_for_its_own_motion_is_no_current_for_the_load(own):
     """Though the load may follow the same: that of a mass does the acceleration."""

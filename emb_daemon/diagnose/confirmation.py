@@ -14,7 +14,7 @@ import numpy as np
 
 from emb_daemon.diagnose.comparison import by_log, episodes_by_log, errors, errors_of, whole
 from emb_daemon.diagnose.coordinates import Coordinate
-from emb_daemon.diagnose.evidence import Moments, leave_out
+from emb_daemon.diagnose.evidence import Moments, leave_out, solve_within
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import Q_VALUE
@@ -184,7 +184,8 @@ def _where_worse(selection: Selection, channel: str, before: np.ndarray, after: 
 def _fits_without(selection: Selection, without: str) -> Iterator[tuple[np.ndarray, dict[Coordinate, float]]]:
     """Each quarter of the episodes as a mask, shape (episodes,), with the parameters that the other quarters give."""
     bench = selection.model.bench
-    fold = np.arange(bench.episodes) % _FOLDS
+    # Drawn, since a manoeuvre that is repeated would have one of its phases in a part of its own.
+    fold = np.random.default_rng(0).permutation(np.arange(bench.episodes) % _FOLDS)
     for number in range(_FOLDS):
         values = selection.applied(without)
         for channel in bench.channels:
@@ -218,21 +219,14 @@ def refit(selection: Selection, channel: str, kept: np.ndarray, without: str = "
     """A channel's coordinates from the episodes that are ``kept``, shape (episodes,), ``without`` one suspect; shapes, which
     are not linear, stand as fitted."""
     model = selection.model
-    linear = [c for c in model.own(channel) if not is_shape(c)]
-    if channel == without or not linear or channel not in selection.touched:
+    centre = {c: model.centre.get(c, c.start) for c in model.own(channel) if not is_shape(c)}
+    free = [c for c in centre if c.effect != without or not without]
+    if channel == without or not free or channel not in selection.touched:
         return {}
-    table = np.column_stack([model.columns[c] for c in linear])
-    centre = np.array([model.centre.get(c, c.start) for c in linear])
-    restored = model.residual_at(channel, dict(zip(linear, centre, strict=True)))
-    free = np.array([c.effect != without or not without for c in linear])
-    moments = Moments.of(table[:, free], restored, model.bench.episode[channel], model.bench.episodes)
-    penalty = model.penalty([c for c, use in zip(linear, free, strict=True) if use], channel)
-    found = leave_out(Moments(moments.products[kept], moments.counts[kept]), penalty).values
-    moved = centre.copy()
-    moved[free] += found
-    return {
-        c: float(np.clip(value, c.low, c.high)) for c, value, use in zip(linear, moved, free, strict=True) if use
-    }  # fmt: skip
+    moments = model.moments(channel, [model.columns[c] for c in free], model.residual_at(channel, centre))
+    low, high = np.array([(c.low - centre[c], c.high - centre[c]) for c in free]).T
+    moved = solve_within(Moments(moments.products[kept], moments.counts[kept]), model.penalty(free, channel), low, high)
+    return {c: float(centre[c] + by) for c, by in zip(free, moved, strict=True)}
 
 
 def harm(before: EpisodeErrors, after: EpisodeErrors, main: str, tolerated: float = HARM) -> str:

@@ -66,7 +66,11 @@ class Coordinate:
 
     def sigma_of(self, value: float, sigma: float) -> float:
         """Standard deviation of a fitted value: one at a bound of what is searched is known no better than it has moved."""
-        return max(sigma, abs(value - self.start)) if np.isclose(value, (self.low, self.high)).any() else sigma
+        return max(sigma, abs(value - self.start)) if self.is_held(value) else sigma
+
+    def is_held(self, value: float) -> bool:
+        """Whether a bound holds a fitted value, which a search that stays inside comes no nearer to than a step."""
+        return not self.low + self.step < value < self.high - self.step
 
 
 Values = Mapping[Coordinate, float]

@@ -331,7 +331,7 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
         channel, gain = group[0].channel, 0.0
         # What stands as chosen was fitted elsewhere.
         if not model.chosen.issuperset(group):
-            rest = [c for c in model.own(channel) if c not in group]
+            rest = [c for c in model.movable(channel) if c not in group]
             without = model.bench.residual_held({**model.values, **{c: c.start for c in group}}, channel, model.heat)
             gain = model.rms(model.left_out(channel, rest, without).sum() - model.left_out(channel).sum(), channel)
         for c in group:

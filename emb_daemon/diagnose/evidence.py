@@ -114,6 +114,17 @@ def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
     return LeftOut(values, covariance, left_out, without)
 
 
+def solve_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Penalised least squares within bounds, shape (columns,), as those of a fit: what one value must not take the others do
+    otherwise."""
+    from scipy.optimize import lsq_linear
+
+    total = moments.products.sum(axis=0)
+    ridge = np.diag(penalty + 1e-10 * np.diag(total)[:-1] + 1e-12)
+    root = np.linalg.cholesky(total[:-1, :-1] + ridge).T
+    return lsq_linear(root, np.linalg.solve(root.T, total[:-1, -1]), (low, high), "bvls").x
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the episodes say of a candidate.

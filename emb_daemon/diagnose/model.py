@@ -80,6 +80,11 @@ class Model:
         """What is fitted in a channel."""
         return [c for c in self.values if c.channel == channel and c not in self.chosen]
 
+    def movable(self, channel: str) -> list[Coordinate]:
+        """What no bound holds of that: what the others do a line must not put down to one that cannot go on, as a drag that
+        drives or an offset of the load, which is a friction below zero where a motor turns one way."""
+        return [c for c in self.own(channel) if not c.is_held(self.values[c])]
+
     def of_effect(self, name: str) -> list[Coordinate]:
         return [c for c in self.values if c.effect == name]
 
@@ -213,16 +218,15 @@ class Model:
 
     def residual_at(self, channel: str, elsewhere: Values) -> np.ndarray:
         """A channel's residual with some of its coordinates elsewhere, by their regressors."""
-        back = np.array([self.values[c] - value for c, value in elsewhere.items()])
-        return self.residual[channel] + np.column_stack([self.columns[c] for c in elsewhere]) @ back
+        return self.residual[channel] + sum(self.columns[c] * (self.values[c] - value) for c, value in elsewhere.items())
 
     def left_out(
         self, channel: str, free: Sequence[Coordinate] | None = None, residual: np.ndarray | None = None, samples: int = 1
     ) -> np.ndarray:
         """Squared error of the channel's residual, or another, over each episode by a fit to the others, shape (episodes,).
 
-        ``free``: coordinates that are fitted, all in the channel if none are given; ``samples``: in a mean."""
-        free = self.own(channel) if free is None else free
+        ``free``: coordinates that are fitted, all that can move if none are given; ``samples``: in a mean."""
+        free = self.movable(channel) if free is None else free
         moments = self.moments(channel, [self.columns[c] for c in free], residual, samples)
         return leave_out(moments, self.penalty(free, channel)).left_out
 
@@ -230,7 +234,7 @@ class Model:
         self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = (), samples: int = 1
     ) -> Evidence:
         """Of regressors that are not in the model, everything in it and ``given`` ones free; of means over ``samples``."""
-        free = self.own(channel)
+        free = self.movable(channel)
         moments = self.moments(channel, [*(self.columns[c] for c in free), *given, *own], samples=samples)
         penalty = np.concatenate([self.penalty(free, channel), np.zeros(len(given) + len(own))])
         first = len(free) + len(given)
@@ -243,11 +247,11 @@ class Model:
         An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do."""
         tested = list(values)
         channel, effects = tested[0].channel, {c.effect for c in tested if c.effect}
-        free = [c for c in self.own(channel) if c in values or c.effect not in effects or not is_shape(c)]
-        restored = self.residual_at(channel, {c: values.get(c, self.centre.get(c, c.start)) for c in free})
-        moments = self.moments(channel, [self.columns[c] for c in free], restored, samples)
-        rest = [index for index, c in enumerate(free) if c not in values]
-        return judge(moments, rest, [free.index(c) for c in tested], self.penalty(free, channel))
+        rest = [c for c in self.movable(channel) if c not in values and (c.effect not in effects or not is_shape(c))]
+        restored = self.residual_at(channel, {c: self.centre.get(c, c.start) for c in rest} | dict(values))
+        moments = self.moments(channel, [self.columns[c] for c in (*rest, *tested)], restored, samples)
+        first, penalty = len(rest), self.penalty([*rest, *tested], channel)
+        return judge(moments, list(range(first)), list(range(first, len(penalty))), penalty)
 
     def counted(self, channel: str) -> int:
         """Residuals of a channel that say something."""

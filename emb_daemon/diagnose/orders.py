@@ -59,7 +59,7 @@ def _peaks(power: np.ndarray, orders: np.ndarray) -> list[tuple[float, float]]:
 
 def _beside_the_model(model: Model, channel: str) -> np.ndarray:
     """The part of a residual that no coordinate of the model explains."""
-    own, residual = model.own(channel), model.residual[channel]
+    own, residual = model.movable(channel), model.residual[channel]
     if not own:
         return residual
     table = np.column_stack([model.columns[c] for c in own])

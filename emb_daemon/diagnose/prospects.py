@@ -77,7 +77,7 @@ class Screen:
         bench = model.bench
         self.means: Averaging = bench.means(channel, samples)
         self._bounds = np.searchsorted(self.means.episode, np.arange(bench.episodes + 1))
-        own = model.own(channel)
+        own = model.movable(channel)
         penalty = model.penalty(own, channel) + 1e-12
         table = np.column_stack([*(model.columns[c] for c in own), model.residual[channel]])
         averaged = self.means.of(table)

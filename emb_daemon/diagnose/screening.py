@@ -262,7 +262,7 @@ class Screening:
         ``samples``."""
         if channel not in FORCE_CHANNELS:
             return {}
-        own = model.own(channel)
+        own = model.movable(channel)
         base, prior = [model.columns[c] for c in own], model.penalty(own, channel)
         keep = model.residual[channel] != 0.0
         plain = model.left_out(channel, samples=samples)

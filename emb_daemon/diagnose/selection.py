@@ -179,7 +179,7 @@ def find_recalibrated(selection: Selection, start: Model, channels: Iterable[str
 def recalibration_gain(model: Model, start: Model, channel: str) -> float:
     """RMS that refitting a channel's base parameters takes on left-out episodes from what it leaves at the ``start``."""
     # About where the fit ended: the line that touches the start does not lead there where friction turns over at once.
-    restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in model.own(channel)})
+    restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in model.movable(channel)})
     left_out = model.left_out(channel, residual=restored)
     before = float(start.residual[channel] @ start.residual[channel])
     return model.rms(before - float(left_out.sum()), channel)
@@ -317,23 +317,29 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
     amplitudes = [c for c in model.of_effect(name) if not is_shape(c)]
     if model.chosen.issuperset(amplitudes):
         return None
+    from scipy.stats import ttest_1samp
+
     over_grammar = candidate.made or candidate.names
     floor = selection.screening.floor(model, candidate.channel, candidate.made)
     whole = len(groups(candidate.effect, amplitudes)) == 1
     gone, gains = [], []
     for group in groups(candidate.effect, amplitudes):
-        evidence = model.evidence_against(dict.fromkeys(group, 0.0), LASTING[candidate.channel] if over_grammar else 1)
-        gain = model.rms(evidence.gain, candidate.channel)
-        if over_grammar and whole and 0.0 < gain < floor:
+        samples = LASTING[candidate.channel] if over_grammar else 1
+        evidence = model.evidence_against(dict.fromkeys(group, 0.0), samples)
+        gain, chance = model.rms(evidence.gain, candidate.channel), evidence.p_value
+        if whole and (0.0 < gain < floor if over_grammar else min(gain, Q_VALUE - chance) <= 0.0):
             # From where a far fit ended a line does not lead back: what it gains, a fit without it says.
             without = model.without(model.of_effect(name)).refined({candidate.channel})
-            before, after = (m.left_out(candidate.channel, samples=LASTING[candidate.channel]).sum() for m in (without, model))
-            gain = model.rms(before - after, candidate.channel)
+            fall = np.subtract(*(m.left_out(candidate.channel, samples=samples) for m in (without, model)))
+            gain, chance = (
+                model.rms(fall.sum(), candidate.channel),
+                float(ttest_1samp(fall, 0.0, alternative="greater").pvalue),
+            )
         little = gain < floor
         # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter; and so must
         # what is gained where a prior alone says how large it is.
-        chance = evidence.p_value > Q_VALUE and not over_grammar
-        if evidence.gain <= 0.0 or chance or (little and (over_grammar or not _is_carried(model, group))):
+        by_chance = chance > Q_VALUE and not over_grammar
+        if gain <= 0.0 or by_chance or (little and (over_grammar or not _is_carried(model, group))):
             gone += group
             gains.append(gain / floor)
     return (max(gains), name, gone) if gone else None

@@ -136,21 +136,28 @@ def has_dead_current(corner: str, messages: dict[str, Signals]) -> bool:
     return not np.any(current.values if isinstance(current, Series) else current)
 
 
+def _in_motion(samples: Records, beside: np.ndarray) -> np.ndarray:
+    """Speed, current, acceleration and another signal, (n,), of SAMPLE rows in which the motor moves and all is known; none if
+    they are few, or so rare that it is accelerated and braked again between them."""
+    speed, current = (samples[name].astype(float) for name in ("speed", "current_q"))
+    acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
+    every = np.stack([speed, current, acceleration, beside])
+    known = samples["has_current"] & np.isfinite(every[1:]).all(axis=0)
+    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
+        return every[:, :0]
+    rows = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
+    return every[:, rows if len(rows) >= _LEAST else rows[:0]]
+
+
 def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2: float) -> list[str]:
     """A line if the current accelerates the motor of SAMPLE rows as if its inertia were far from the one stated: then angle or
     current is in another unit, of another place, or of another motor."""
-    speed, current, angle = (samples[name].astype(float) for name in ("speed", "current_q", "angle"))
-    acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
-    known = samples["has_current"] & np.isfinite(current) & np.isfinite(angle) & np.isfinite(acceleration)
-    # Between rare samples a motor is accelerated and braked again.
-    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
+    speed, current, acceleration, angle = _in_motion(samples, samples["angle"].astype(float))
+    if not np.ptp(angle, initial=0.0):
         return []
-    moving = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
-    if len(moving) < _LEAST or not np.ptp(angle[moving]):
-        return []
-    way = (angle[moving] - angle[moving[0]]) / np.ptp(angle[moving])
-    known = np.column_stack([np.ones(len(way)), np.sign(speed[moving]), speed[moving], way, way**2, way**3])
-    columns = np.column_stack([current[moving], acceleration[moving]])
+    way = (angle - angle[0]) / np.ptp(angle)
+    known = np.column_stack([np.ones(len(way)), np.sign(speed), speed, way, way**2, way**3])
+    columns = np.column_stack([current, acceleration])
     left = columns - known @ np.linalg.lstsq(known, columns)[0]
     if not np.all(np.ptp(left, axis=0) > 0.0):
         return []
@@ -182,21 +189,15 @@ def other_current(samples: Records, force_N: np.ndarray, motor: Motor) -> list[s
     Args:
         force_N: clamp force, (n,); NaN where it is not known.
     """
-    speed, current = (samples[name].astype(float) for name in ("speed", "current_q"))
-    acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
-    known = samples["has_current"] & np.isfinite(current) & np.isfinite(force_N) & np.isfinite(acceleration)
-    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
+    speed, current, acceleration, force = _in_motion(samples, force_N)
+    if not len(force):
         return []
-    rows = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
-    sign, force = np.sign(speed[rows]), force_N[rows]
-    rest = np.column_stack([np.ones(len(rows)), sign, speed[rows], sign * force])
-    torques = {"load": motor.gear_gain_m_per_rad * force, "acceleration": motor.inertia_kg_m2 * acceleration[rows]}
-    explained = motor.torque_constant_Nm_per_A * current[rows]
+    rest = np.column_stack([np.ones(len(force)), np.sign(speed), speed, np.sign(speed) * force])
+    torques = {"load": motor.gear_gain_m_per_rad * force, "acceleration": motor.inertia_kg_m2 * acceleration}
+    explained = motor.torque_constant_Nm_per_A * current
     shares = []
     for name, torque in torques.items():
         others = np.column_stack([rest, *(column for other, column in torques.items() if other != name)])
-        if len(rows) < _LEAST:
-            return []
         columns = np.column_stack([torque, explained])
         left = columns - others @ np.linalg.lstsq(others, columns)[0]
         if not np.all(np.ptp(left, axis=0) > 0.0) or np.corrcoef(left.T)[0, 1] < _TOLD_INERTIA:

@@ -68,6 +68,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
 #: A semicolon at the end of a line.
 _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
+#: Lines at the end of a text that do not begin with a number.
+_WORDS = re.compile(rb'(?:(?:^|\n)(?![ \t"]*[+-]?[\d.,]).*)+\Z')
 #: Cells that mean that nothing was measured.
 _NOTHING = ["", "-", "--", "---", "NA", "N/A", "#N/A", "n/a", "NaN", "nan", "NULL", "null", "None"]
 
@@ -381,6 +383,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
             lines[at[0]].count(at[1]),
         ),
     )
+    content = _under_one_header(path, content, header)
     cells = _cells(lines[header], delimiter)
     by_place = all(map(_BY_PLACE.fullmatch, names))
     if not {*names} & {*cells} and (found := _without_header(lines, by_place)):
@@ -448,6 +451,19 @@ def _text_table(path: Path, content: bytes, names: list[str]):
         for field, unit in itertools.zip_longest(table.schema, stated[: table.num_columns], fillvalue="")
     ]
     return pyarrow.Table.from_arrays(table.columns, schema=pyarrow.schema(fields))
+
+
+def _under_one_header(path: Path, content: bytes, header: int) -> bytes:
+    """A table whose header is repeated, over each segment that LabVIEW writes or by a logger switched on again, without that
+    and the words above it."""
+    line = content.split(b"\n", header + 1)[header]
+    over, *parts = (b"\n" + content).split(b"\n" + line + b"\n")
+    if len(parts) < 2 or not line.strip() or _is_number(line.decode(errors="replace").strip()):
+        return content
+    told = f"the header is repeated {len(parts) - 1} times; that and the words above it are left out"
+    print(f"{path}: {told}", file=sys.stderr)
+    above = [_WORDS.sub(b"", part) if header else part for part in parts[:-1]]
+    return b"\n".join([over, line, *above, parts[-1]])[1:]
 
 
 def _are_pairs(names: list[str], rows: list[list[str]]) -> bool:
