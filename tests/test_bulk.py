@@ -1,16 +1,21 @@
 """Binary logs read in bulk: what python-can gives frame by frame, and nothing of a damaged file."""
 
+import contextlib
 import io
+import os
 import struct
+import subprocess
+import sys
 import zlib
 from itertools import pairwise
 
 import can
 import numpy as np
+import psutil
 import pytest
 
 from emb_daemon.errors import InputError
-from emb_daemon.logs import inflate, read
+from emb_daemon.logs import apart, inflate, read
 from emb_daemon.logs.read import read_frames, read_log
 from emb_daemon.wire.frames import EXTENDED, FRAME, row_of
 
@@ -220,3 +225,29 @@ def test_an_mdf4_log_of_one_kind_of_frame_is_narrow(mdf, tmp_path):
     assert frames["length"].tolist() == [0, 1, 2, 3, 4] and frames["data"].tolist() == [0, 1, 0x202, 0x30303, 0x4040404]
     # python-can's writer has the times in floating point, to a fifth of a microsecond.
     np.testing.assert_allclose(np.diff(frames["time_ns"]), 4_000_000, atol=300)
+
+
+def test_a_reader_of_mdf4_that_died_is_begun_anew(mdf):
+    frames = read_frames(mdf)
+    reader = apart._reader(os.pathsep.join(filter(None, sys.path)))
+    reader.kill()
+    reader.wait()
+    with pytest.raises(InputError, match="is gone; try again"):
+        read_frames(mdf)
+    np.testing.assert_array_equal(read_frames(mdf), frames)
+
+
+def test_a_reader_of_mdf4_ends_with_who_asked_it(mdf):
+    """Killed, it can tell nobody."""
+    code = f"""if True:
+        import os, sys
+        from emb_daemon.logs import apart
+        from emb_daemon.logs.read import read_frames
+        read_frames({str(mdf)!r})
+        print(apart._reader(os.pathsep.join(filter(None, sys.path))).pid, flush=True)
+        os.kill(os.getpid(), 9)
+    """
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert done.returncode == -9
+    with contextlib.suppress(psutil.NoSuchProcess):
+        psutil.Process(int(done.stdout)).wait(timeout=30)

@@ -19,6 +19,8 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE
 _HEADER, _SIZE_AT, _START_AT = 72, 4, 40
 #: Bytes of an object's header that all versions have, and of a container's; how the content of one is packed.
 _BASE, _CONTAINER_HEADER = 16, 32
+#: Size of the shortest frame's object.
+_LEAST_FRAME = 40
 _PLAIN, _DEFLATED = 0, 2
 #: Kinds of objects.
 _CAN, _CAN_2, _CAN_ERROR, _CAN_FD, _CAN_FD_64, _CONTAINER = 1, 86, 73, 100, 101, 10
@@ -163,7 +165,7 @@ def read_blf(path: Path, content: bytes, most_bytes: int) -> tuple[np.ndarray, n
         raise InputError(f"{path}: not a BLF file")
     header = int.from_bytes(content[_SIZE_AT : _SIZE_AT + 4], "little")
     unpacked, cut = _objects(path, content, max(header, _HEADER), most_bytes)
-    most = unpacked.count(b"LOBJ") + 1
+    most = len(unpacked) // _LEAST_FRAME + 1
     frames, channels, octets = np.zeros(most, FRAME), np.zeros(most, np.uint16), np.zeros(len(unpacked), np.uint8)
     count, ended, at = _parse(np.frombuffer(unpacked, np.uint8), _start_ns(content), frames, octets, channels)
     if ended == _DAMAGED:
