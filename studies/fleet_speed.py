@@ -29,7 +29,7 @@ from emb_daemon.fleet.ingest import Job, ingest
 from emb_daemon.fleet.replaying import replay_drive
 from emb_daemon.fleet.scores import Scorer
 from emb_daemon.logs.candump import parse_candump
-from emb_daemon.logs.read import log_ending, read_file, read_frames, unpack
+from emb_daemon.logs.read import log_ending, read_file, read_frames, read_log, unpack
 from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
@@ -110,7 +110,7 @@ def readings(path: Path) -> Iterator[Reading]:
         for ending, reader in readers.items():
             copy = Path(folder, f"drive{ending}")
             write_frames(copy, frames)
-            bulk, single = _time(partial(read_frames, copy)), _spent(partial(_read_one_by_one, reader, copy))
+            bulk, single = _time(partial(read_log, copy)), _spent(partial(_read_one_by_one, reader, copy))
             yield Reading(ending, seconds / bulk, seconds / single)
 
 

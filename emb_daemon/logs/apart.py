@@ -36,7 +36,7 @@ _one_at_a_time = threading.Lock()
 
 def mdf_columns(path: Path, content: bytes, most_bytes: int) -> dict[str, np.ndarray]:
     """Columns of all CAN frames of an MDF4 log in order of time, read with ``most_bytes`` of memory: ``time_ns``, ``can_id``,
-    ``length``, whether ``extended``, ``remote``, ``error`` or ``fd``, ``channel``, shape (n,), and ``octets``, shape (n, width).
+    ``length``, whether ``extended``, ``remote``, ``error`` or ``fd``, ``channel``, shape (n,), and ``octets``, shape (n, w).
     Empty if there is none.
 
     Raises:
