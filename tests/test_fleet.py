@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -199,6 +200,13 @@ def test_workers_may_die(tmp_path, monkeypatch, lives):
     assert done[:5] + done[6:] == [0, 1, 4, 9, 16, 36, 49]
     assert done[5].startswith("5: ")
     assert told == [(number, 8) for number in range(1, 9)]
+
+
+@pytest.mark.trial
+def test_a_worker_has_no_reader_of_files_that_another_process_reads():
+    with cluster(workers=1) as client:
+        [loaded] = client.run(lambda: {name: name in sys.modules for name in ("can", "asammdf")}).values()
+    assert loaded == {"can": True, "asammdf": False}
 
 
 def test_the_end_of_the_work_waits_for_a_worker_that_is_just_started_again(monkeypatch):
