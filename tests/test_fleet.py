@@ -377,6 +377,65 @@ def test_units_that_differ_by_their_noise_alone_have_no_spread():
     assert found.spread == 0.0
 
 
+def _scores(rng, unit, amounts, count, causes=4, warmth=None):
+    """Synthetic drives of one unit, a day apart: each has information of its own, and ``amounts(drive)`` of the causes with
+    noise. One unit of a cause makes 50 N."""
+    result = []
+    for number in range(count):
+        table = 50.0 * rng.standard_normal((200, causes))
+        residual = table @ amounts(number) + 20.0 * rng.standard_normal(200)
+        table = np.column_stack([table, residual])
+        drive = dataset.Drive(unit, "FL", "", number * 86_400_000_000_000, f"{number:016x}")
+        result.append(scores.Score(drive, table.T @ table, 200, 20.0 if warmth is None else warmth[number]))
+    return result
+
+
+def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
+    """However few drives it has; and its size is not drawn to zero."""
+    rng, truth = np.random.default_rng(0), np.array([1.0, -2.0, 0.0, 0.5])
+    flat = population.Directions(np.eye(4) / 50.0, np.eye(4) * 50.0, np.full(4, 50.0))
+    units = []
+    for _ in range(400):
+        from_drive_to_drive = 0.3 * rng.standard_normal((4, 4))
+        drives = _scores(rng, "u", lambda number, own=from_drive_to_drive: truth + own[number], 4)
+        units.append(population.unit_of(drives, flat, np.ones((4, 1))))
+    values, noise = np.array([unit.values[0] for unit in units]), np.array([np.diag(unit.noise[0]) for unit in units])
+    np.testing.assert_allclose(values.mean(axis=0) / 50.0, truth, atol=0.03)
+    np.testing.assert_allclose(noise.mean(axis=0), values.var(axis=0), rtol=0.15)
+
+
+def test_a_small_batch_that_scatters_more_is_not_accused_for_that():
+    rng = np.random.default_rng(0)
+    chances = [population._compare(3.0 * rng.standard_normal(5), rng.standard_normal(55))[0] for _ in range(600)]
+    # Binomial, 0.1 %; were both thought to scatter alike, it would be a third.
+    assert np.mean(np.array(chances) < 0.05) < 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 600)
+
+
+@pytest.mark.parametrize(("per_30_days", "per_10_K"), [(1.5, 0.0), (0.0, 0.8), (-1.0, -1.0), (0.0, 0.0)])
+def test_drift_and_season_are_told_apart_with_their_sizes(per_30_days, per_10_K):
+    """Of the first cause, in each unit somewhat differently; days and warmth are not the same."""
+    rng = np.random.default_rng(1)
+    fleet = {}
+    for number in range(14):
+        unit, own = f"unit-{number}", 1.0 + 0.1 * rng.standard_normal()
+        warmth = 15.0 + 6.0 * rng.standard_normal(12)
+        level = 0.05 * rng.standard_normal(4)
+
+        def amounts(drive, level=level, own=own, warmth=warmth):
+            moved = own * (per_30_days * drive / 30.0 + per_10_K * (warmth[drive] - 15.0) / 10.0)
+            return level + np.array([moved, 0.0, 0.0, 0.0]) + 0.03 * rng.standard_normal(4)
+
+        fleet[unit, "FL"] = _scores(rng, unit, amounts, 12, warmth=warmth)
+    causes = [scores.Cause(f"effects.{name}", name, None, "1") for name in "abcd"]
+    found = findings.find(fleet, causes, "", {}, {})
+    for told, truth in ((found.drifts, per_30_days), (found.seasons, per_10_K)):
+        assert [(one.where, one.cause) for one in told] == [("all units", "a")] * (truth != 0.0)
+        for one in told:
+            assert one.amount == pytest.approx(truth, rel=0.15) and abs(one.amount - truth) < 4.0 * one.sigma
+            assert one.size_N == pytest.approx(50.0 * one.amount, rel=0.1)
+    assert not found.groups and not found.outliers
+
+
 # -- end to end -------------------------------------------------------------------------------------------------------
 
 
@@ -481,6 +540,7 @@ def test_a_training_is_learned_once(tmp_path, calibration, monkeypatch):
     assert told["trainings"] == 1 and entry["outcome"] == "accepted"
     assert entry["values"]["friction.load_m_per_rad"] == pytest.approx(plant["load_friction"], rel=0.1)
     assert learning.learn_unit(tmp_path, drives, calibration) == told
+    assert learning.learn_unit(tmp_path, drives * 2, calibration)["drives"] == told["drives"] * 2
     assert learning.population(tmp_path, calibration)
     monkeypatch.setattr(dataset, "_kernels", lambda: "another estimator")
     assert not learning.population(tmp_path, calibration)
@@ -492,11 +552,16 @@ def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
     friction = calibration.friction.load_m_per_rad
     values = {"friction.offset_Nm": 0.03, "friction.presliding_angle_rad": 0.03, "contact.clearance_rad": 7.5}
     for unit in range(40):
-        own = values | {"friction.load_m_per_rad": friction * (1.1 + 0.05 * rng.standard_normal())}
-        entry = {"values": own, "sigmas": dict.fromkeys(own, 1e-9), "outcome": "accepted"}
+        own = values | {
+            "friction.load_m_per_rad": friction * (1.1 + 0.05 * rng.standard_normal()),
+            "contact.clearance_rad": 7.5 + 0.2 * rng.standard_normal(),
+        }
+        # What was learned before counts no more, and what was refused never did.
+        before = {key: 3.0 * value for key, value in own.items()}
+        entries = [{"values": v, "sigmas": dict.fromkeys(v, 1e-9), "outcome": ""} for v in (before, own, {})]
         path = learning.learned_path(tmp_path, f"unit-{unit}", "FL")
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps({"made_by": dataset.made_by(calibration), "entries": [entry]}))
+        path.write_text(json.dumps({"made_by": dataset.made_by(calibration), "entries": entries}))
     save_calibration(calibration, tmp_path / "old.yaml")
     command = ["fleet", "prior", str(tmp_path), "--calibration", str(tmp_path / "old.yaml"), "--output"]
     assert main([*command, str(tmp_path / "new.yaml")]) == 0
@@ -505,6 +570,9 @@ def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
     assert made.provenance.sigmas["friction.load_m_per_rad"] == pytest.approx(0.05 * friction, rel=0.4)
     # Four such widths of the friction at full force, a fifth of which is the offset's.
     assert 0.1 < made.adaptation.friction_change < 0.3
+    assert made.contact.clearance_rad == pytest.approx(7.5, abs=0.1)
+    assert made.contact.clearance_sigma_rad == pytest.approx(0.2, rel=0.4)
+    assert made.adaptation.clearance_change_rad == pytest.approx(4.0 * made.contact.clearance_sigma_rad)
 
 
 def test_without_trainings_there_is_no_prior(tmp_path, calibration):
