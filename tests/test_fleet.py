@@ -404,6 +404,21 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
     np.testing.assert_allclose(noise.mean(axis=0), values.var(axis=0), rtol=0.15)
 
 
+def test_who_asks_twice_as_many_questions_is_half_as_sure():
+    """The same causes listed twice tell nothing new of anybody."""
+    values, prints, groups, factors = _fleet(np.random.default_rng(3))
+    values[10] += 12.0 * prints[2]
+    values[groups["batch 1"]] += 3.0 * prints[4]
+    chances = []
+    for causes in (prints, np.concatenate([prints, prints])):
+        centre, readings = _read(values, causes, factors)
+        [unit] = [one for one in population.outliers(values - centre, readings) if one.row == 10]
+        batch = population.shared_causes(values, groups, causes, readings, beside=True)[0]
+        chances.append((unit.chance, batch.chance))
+    np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
+    assert min(chances[0]) > 0.0
+
+
 def test_a_small_batch_that_scatters_more_is_not_accused_for_that():
     rng = np.random.default_rng(0)
     chances = [population._compare(3.0 * rng.standard_normal(5), rng.standard_normal(55))[0] for _ in range(600)]
