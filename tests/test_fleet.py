@@ -419,6 +419,17 @@ def test_who_asks_twice_as_many_questions_is_half_as_sure():
     assert min(chances[0]) > 0.0
 
 
+def test_a_unit_is_measured_by_the_scatter_of_others():
+    """By its own, it would excuse itself."""
+    values, prints, _, factors = _fleet(np.random.default_rng(4))
+    centre, readings = _read(values, prints, factors)
+    values[7] += 3.0 * prints[1]
+    noise = np.broadcast_to(0.01 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
+    again = population.Readings(values, centre, prints, noise)
+    np.testing.assert_allclose(again.filters[7], readings.filters[7], rtol=1e-9)
+    assert np.abs(again.filters[8] / readings.filters[8] - 1.0).max() > 1e-3
+
+
 def test_a_small_batch_that_scatters_more_is_not_accused_for_that():
     rng = np.random.default_rng(0)
     chances = [population._compare(3.0 * rng.standard_normal(5), rng.standard_normal(55))[0] for _ in range(600)]

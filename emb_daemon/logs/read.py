@@ -207,7 +207,7 @@ _PARSERS: dict[str, Callable[[Path, bytes], _Parsed]] = {
     ".csv": partial(_python_can, "CSVReader"),
 }
 #: Endings of log files, before ``.gz``.
-LOG_ENDINGS = tuple(_PARSERS)
+LOG_ENDINGS: tuple[str, ...] = tuple(_PARSERS)
 
 
 def ids_in(frames: np.ndarray) -> str:
