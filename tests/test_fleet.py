@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -201,6 +202,13 @@ def test_workers_may_die(tmp_path, monkeypatch, lives):
     assert told == [(number, 8) for number in range(1, 9)]
 
 
+@pytest.mark.trial
+def test_a_worker_has_no_reader_of_files_that_another_process_reads():
+    with cluster(workers=1) as client:
+        [loaded] = client.run(lambda: {name: name in sys.modules for name in ("can", "asammdf")}).values()
+    assert loaded == {"can": True, "asammdf": False}
+
+
 def test_the_end_of_the_work_waits_for_a_worker_that_is_just_started_again(monkeypatch):
     """Distributed fails to close one."""
     from distributed import LocalCluster
@@ -369,6 +377,91 @@ def test_units_that_differ_by_their_noise_alone_have_no_spread():
     assert found.spread == 0.0
 
 
+def _scores(rng, unit, amounts, count, causes=4, warmth=None):
+    """Synthetic drives of one unit, a day apart: each has information of its own, and ``amounts(drive)`` of the causes with
+    noise. One unit of a cause makes 50 N."""
+    result = []
+    for number in range(count):
+        table = 50.0 * rng.standard_normal((200, causes))
+        residual = table @ amounts(number) + 20.0 * rng.standard_normal(200)
+        table = np.column_stack([table, residual])
+        drive = dataset.Drive(unit, "FL", "", number * 86_400_000_000_000, f"{number:016x}")
+        result.append(scores.Score(drive, table.T @ table, 200, 20.0 if warmth is None else warmth[number]))
+    return result
+
+
+def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
+    """However few drives it has; and its size is not drawn to zero."""
+    rng, truth = np.random.default_rng(0), np.array([1.0, -2.0, 0.0, 0.5])
+    flat = population.Directions(np.eye(4) / 50.0, np.eye(4) * 50.0, np.full(4, 50.0))
+    units = []
+    for _ in range(400):
+        from_drive_to_drive = 0.3 * rng.standard_normal((4, 4))
+        drives = _scores(rng, "u", lambda number, own=from_drive_to_drive: truth + own[number], 4)
+        units.append(population.unit_of(drives, flat, np.ones((4, 1))))
+    values, noise = np.array([unit.values[0] for unit in units]), np.array([np.diag(unit.noise[0]) for unit in units])
+    np.testing.assert_allclose(values.mean(axis=0) / 50.0, truth, atol=0.03)
+    np.testing.assert_allclose(noise.mean(axis=0), values.var(axis=0), rtol=0.15)
+
+
+def test_who_asks_twice_as_many_questions_is_half_as_sure():
+    """The same causes listed twice tell nothing new of anybody."""
+    values, prints, groups, factors = _fleet(np.random.default_rng(3))
+    values[10] += 12.0 * prints[2]
+    values[groups["batch 1"]] += 3.0 * prints[4]
+    chances = []
+    for causes in (prints, np.concatenate([prints, prints])):
+        centre, readings = _read(values, causes, factors)
+        [unit] = [one for one in population.outliers(values - centre, readings) if one.row == 10]
+        batch = population.shared_causes(values, groups, causes, readings, beside=True)[0]
+        chances.append((unit.chance, batch.chance))
+    np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
+    assert min(chances[0]) > 0.0
+
+
+def test_a_unit_is_measured_by_the_scatter_of_others():
+    """By its own, it would excuse itself."""
+    values, prints, _, factors = _fleet(np.random.default_rng(4))
+    centre, readings = _read(values, prints, factors)
+    values[7] += 3.0 * prints[1]
+    noise = np.broadcast_to(0.01 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
+    again = population.Readings(values, centre, prints, noise)
+    np.testing.assert_allclose(again.filters[7], readings.filters[7], rtol=1e-9)
+    assert np.abs(again.filters[8] / readings.filters[8] - 1.0).max() > 1e-3
+
+
+def test_a_small_batch_that_scatters_more_is_not_accused_for_that():
+    rng = np.random.default_rng(0)
+    chances = [population._compare(3.0 * rng.standard_normal(5), rng.standard_normal(55))[0] for _ in range(600)]
+    # Binomial, 0.1 %; were both thought to scatter alike, it would be a third.
+    assert np.mean(np.array(chances) < 0.05) < 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 600)
+
+
+@pytest.mark.parametrize(("per_30_days", "per_10_K"), [(1.5, 0.0), (0.0, 0.8), (-1.0, -1.0), (0.0, 0.0)])
+def test_drift_and_season_are_told_apart_with_their_sizes(per_30_days, per_10_K):
+    """Of the first cause, in each unit somewhat differently; days and warmth are not the same."""
+    rng = np.random.default_rng(1)
+    fleet = {}
+    for number in range(14):
+        unit, own = f"unit-{number}", 1.0 + 0.1 * rng.standard_normal()
+        warmth = 15.0 + 6.0 * rng.standard_normal(12)
+        level = 0.05 * rng.standard_normal(4)
+
+        def amounts(drive, level=level, own=own, warmth=warmth):
+            moved = own * (per_30_days * drive / 30.0 + per_10_K * (warmth[drive] - 15.0) / 10.0)
+            return level + np.array([moved, 0.0, 0.0, 0.0]) + 0.03 * rng.standard_normal(4)
+
+        fleet[unit, "FL"] = _scores(rng, unit, amounts, 12, warmth=warmth)
+    causes = [scores.Cause(f"effects.{name}", name, None, "1") for name in "abcd"]
+    found = findings.find(fleet, causes, "", {}, {})
+    for told, truth in ((found.drifts, per_30_days), (found.seasons, per_10_K)):
+        assert [(one.where, one.cause) for one in told] == [("all units", "a")] * (truth != 0.0)
+        for one in told:
+            assert one.amount == pytest.approx(truth, rel=0.15) and abs(one.amount - truth) < 4.0 * one.sigma
+            assert one.size_N == pytest.approx(50.0 * one.amount, rel=0.1)
+    assert not found.groups and not found.outliers
+
+
 # -- end to end -------------------------------------------------------------------------------------------------------
 
 
@@ -473,6 +566,7 @@ def test_a_training_is_learned_once(tmp_path, calibration, monkeypatch):
     assert told["trainings"] == 1 and entry["outcome"] == "accepted"
     assert entry["values"]["friction.load_m_per_rad"] == pytest.approx(plant["load_friction"], rel=0.1)
     assert learning.learn_unit(tmp_path, drives, calibration) == told
+    assert learning.learn_unit(tmp_path, drives * 2, calibration)["drives"] == told["drives"] * 2
     assert learning.population(tmp_path, calibration)
     monkeypatch.setattr(dataset, "_kernels", lambda: "another estimator")
     assert not learning.population(tmp_path, calibration)
@@ -484,11 +578,16 @@ def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
     friction = calibration.friction.load_m_per_rad
     values = {"friction.offset_Nm": 0.03, "friction.presliding_angle_rad": 0.03, "contact.clearance_rad": 7.5}
     for unit in range(40):
-        own = values | {"friction.load_m_per_rad": friction * (1.1 + 0.05 * rng.standard_normal())}
-        entry = {"values": own, "sigmas": dict.fromkeys(own, 1e-9), "outcome": "accepted"}
+        own = values | {
+            "friction.load_m_per_rad": friction * (1.1 + 0.05 * rng.standard_normal()),
+            "contact.clearance_rad": 7.5 + 0.2 * rng.standard_normal(),
+        }
+        # What was learned before counts no more, and what was refused never did.
+        before = {key: 3.0 * value for key, value in own.items()}
+        entries = [{"values": v, "sigmas": dict.fromkeys(v, 1e-9), "outcome": ""} for v in (before, own, {})]
         path = learning.learned_path(tmp_path, f"unit-{unit}", "FL")
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps({"made_by": dataset.made_by(calibration), "entries": [entry]}))
+        path.write_text(json.dumps({"made_by": dataset.made_by(calibration), "entries": entries}))
     save_calibration(calibration, tmp_path / "old.yaml")
     command = ["fleet", "prior", str(tmp_path), "--calibration", str(tmp_path / "old.yaml"), "--output"]
     assert main([*command, str(tmp_path / "new.yaml")]) == 0
@@ -497,6 +596,9 @@ def test_a_prior_is_as_wide_as_units_differ(tmp_path, calibration):
     assert made.provenance.sigmas["friction.load_m_per_rad"] == pytest.approx(0.05 * friction, rel=0.4)
     # Four such widths of the friction at full force, a fifth of which is the offset's.
     assert 0.1 < made.adaptation.friction_change < 0.3
+    assert made.contact.clearance_rad == pytest.approx(7.5, abs=0.1)
+    assert made.contact.clearance_sigma_rad == pytest.approx(0.2, rel=0.4)
+    assert made.adaptation.clearance_change_rad == pytest.approx(4.0 * made.contact.clearance_sigma_rad)
 
 
 def test_without_trainings_there_is_no_prior(tmp_path, calibration):

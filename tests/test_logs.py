@@ -6,6 +6,7 @@ import gzip
 import lzma
 import os
 import tracemalloc
+import zlib
 
 import can
 import numpy as np
@@ -15,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_daemon.errors import InputError
-from emb_daemon.logs import apart, read
+from emb_daemon.logs import apart, inflate, read
 from emb_daemon.logs.candump import format_candump, parse_candump
 from emb_daemon.logs.columns import Decoder, References
 from emb_daemon.logs.read import read_frames, read_log
@@ -197,8 +198,8 @@ def test_a_gzipped_log_that_is_cut_off_is_read_up_to_the_cut(tmp_path, capsys):
         ),
         ("run.mat", b"MATLAB 5.0", "or --mapping of a table's columns"),
         ("nothing", b"hello", "unknown log format"),
-        ("x.blf", b"not a blf file at all", "BLFReader"),
-        ("x.mf4", b"not an mf4 file at all", "MF4Reader"),
+        ("x.blf", b"not a blf file at all", "not a BLF file"),
+        ("x.mf4", b"not an mf4 file at all", "not readable by asammdf"),
         ("random.log", bytes(range(256)), "not a candump line"),
     ],
 )
@@ -262,38 +263,32 @@ def test_reference_is_the_nearest_in_time_or_nothing():
 
 _READER = """
 import io, os, signal, time
-class TextIOMessageReader: ...
-class BLFReader:
-    def __init__(self, file): ...
-    def __iter__(self):
+class MDF:
+    def __init__(self, file, process_bus_logging):
         %s
-        yield
 """
 
 
 @pytest.mark.parametrize(
     ("deed", "said"),
     [
-        ("os.kill(os.getpid(), signal.SIGSEGV)", r"x.blf: python-can's BLFReader crashed \(SIGSEGV\): damaged"),
-        ("while True: ...", "x.blf: python-can's BLFReader did not come to an end within 1 s: damaged"),
-        ("bytearray(1 << 45)", "x.blf: not readable by python-can's BLFReader: MemoryError"),
-        ("round(1e999)", "x.blf: not readable by python-can's BLFReader: cannot convert float infinity to integer"),
-        ("os._exit(7)", "x.blf: not readable by python-can's BLFReader"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", r"x.mf4: asammdf crashed \(SIGSEGV\): damaged"),
+        ("while True: ...", "x.mf4: asammdf did not come to an end within 1 s: damaged"),
+        ("bytearray(1 << 45)", "x.mf4: not readable by asammdf: MemoryError"),
+        ("round(1e999)", "x.mf4: not readable by asammdf: cannot convert float infinity to integer"),
+        ("os._exit(7)", "x.mf4: not readable by asammdf"),
+        ("import asammdf.nothing", r"x.mf4: this format needs an extra: pip install emb_daemon\[mf4\]"),
     ],
 )
 def test_a_reader_that_fails_takes_nothing_with_it(tmp_path, monkeypatch, deed, said):
     """A reader of somebody else's that does as one told by a damaged file."""
-    package = tmp_path / "can" / "io"
-    package.mkdir(parents=True)
-    (tmp_path / "can" / "__init__.py").write_text(_READER % deed)
-    (package / "__init__.py").touch()
-    (package / "generic.py").write_text("from can import TextIOMessageReader")
-    (tmp_path / "x.blf").write_bytes(bytes(100))
+    (tmp_path / "asammdf.py").write_text(_READER % deed)
+    (tmp_path / "x.mf4").write_bytes(bytes(100))
     monkeypatch.syspath_prepend(tmp_path)
     if "within 1 s" in said:
         monkeypatch.setattr(apart, "_START_S", 1.0)
     with pytest.raises(InputError, match=said):
-        read_frames(tmp_path / "x.blf")
+        read_frames(tmp_path / "x.mf4")
 
 
 @pytest.mark.parametrize(
@@ -321,7 +316,7 @@ def test_a_fast_library_changes_nothing_of_what_is_read_or_said(damage, tmp_path
             return str(error), capsys.readouterr().err
 
     fast = outcome()
-    monkeypatch.setattr(read, "isal_zlib", None)
+    monkeypatch.setattr(inflate, "library", zlib)
     assert outcome() == fast
 
 

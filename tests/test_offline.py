@@ -1,6 +1,8 @@
 """The offline toolbox: read once, run as the estimator runs, fit what was put in, score in one place."""
 
 import ast
+import contextlib
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -204,3 +206,19 @@ def test_an_rmse_is_computed_in_one_module():
         if any(_mean_of_squares(argument) for root in roots for argument in root.args):
             found.add(str(path.relative_to(package.parent)))
     assert found == {"emb_daemon/offline/score.py"}
+
+
+def test_blocks_of_a_fit_run_side_by_side_to_the_same_values():
+    """Two cores: the residuals of one log wait for those of the other, which would never come one after the other."""
+    both = threading.Barrier(2, timeout=30.0)
+
+    def block(target):
+        def residual(values):
+            with contextlib.suppress(threading.BrokenBarrierError):
+                both.wait()
+            return np.array([values["a"] - target, 0.5 * values["a"]])
+
+        return Block(residual, ("a",), np.arange(2))
+
+    found = fit([block(1.0), block(3.0)], {"a": Free(0.0, 1e-6)})
+    assert not both.broken and found.values["a"] == pytest.approx(1.6)

@@ -39,6 +39,8 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
     """
     # One thread each: a worker uses one core, and BLAS must not start more threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Arrow's own allocator keeps what the largest drive took.
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     import dask
     from distributed import Client, LocalCluster
 
@@ -62,6 +64,7 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.ERROR,
+            preload=["emb_daemon.fleet.worker"],
         )
         try:
             with Client(local) as client:

@@ -36,6 +36,8 @@ from emb_daemon.wire.frames import FRAME
 #: Characters of a log's SHA-256 in its name: 64 bits; among 10⁷ logs two are alike with a chance of one in 10⁵.
 DIGEST = 16
 _FORMAT, _KEY = 1, b"emb_daemon"
+#: Rows that are read at once.
+_ROWS = 1 << 14
 _FORCE = "clamp_force_ref_N"
 #: Columns that data sets of format 1 need not have: those of before force sensors were read. Zero says that none was heard.
 _OPTIONAL = {"sensor_force", "has_sensor_force"}
@@ -133,13 +135,17 @@ def read_drive(root: Path, drive: Drive) -> tuple[Log, About]:
     path = Path(root, "drives", drive.partition, f"{drive.digest}.parquet")
     try:
         # The names of the folders are not columns.
-        table = pyarrow.parquet.ParquetFile(path).read(use_threads=False)
-        described = json.loads(table.schema.metadata[_KEY])
-        samples = np.zeros(len(table), SAMPLE)
-        for name in SAMPLE.names:
-            if name not in _OPTIONAL or name in table.column_names:
-                samples[name] = table.column(name).to_numpy()
-        force = table.column(_FORCE).to_numpy() if _FORCE in table.column_names else np.full(len(samples), np.nan)
+        file = pyarrow.parquet.ParquetFile(path)
+        described, columns = json.loads(file.schema_arrow.metadata[_KEY]), file.schema_arrow.names
+        samples, force = np.zeros(file.metadata.num_rows, SAMPLE), np.full(file.metadata.num_rows, np.nan)
+        goals = {name: samples[name] for name in SAMPLE.names if name not in _OPTIONAL or name in columns}
+        goals |= {_FORCE: force} if _FORCE in columns else {}
+        start = 0
+        # In pieces, because a long drive twice does not fit into a worker.
+        for batch in file.iter_batches(_ROWS, use_threads=False):
+            for name, goal in goals.items():
+                goal[start : start + len(batch)] = batch.column(name).to_numpy(zero_copy_only=False)
+            start += len(batch)
     except (OSError, KeyError, TypeError, ValueError, pyarrow.ArrowException) as error:
         raise InputError(f"{path}: not a drive of this data set: {error}") from None
     about = About(**{name: described[name] for name in About.__dataclass_fields__})

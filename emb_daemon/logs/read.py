@@ -11,7 +11,7 @@ import sys
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 
@@ -19,23 +19,15 @@ import numpy as np
 
 from emb_daemon.bounded import read_input
 from emb_daemon.errors import InputError
-from emb_daemon.logs.apart import frames_apart, frames_of
+from emb_daemon.logs.apart import mdf_columns
+from emb_daemon.logs.blf import read_blf
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.dialects import as_candump, tidied_trace
+from emb_daemon.logs.inflate import inflate
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.wire.contract import CYCLE_NS
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, row_of
 
-try:
-    # Four times as fast as zlib, where it is installed.
-    from isal import isal_zlib
-except ImportError:
-    isal_zlib = None
-
-_PYTHON_CAN = {".asc": "ASCReader", ".blf": "BLFReader", ".trc": "TRCReader", ".mf4": "MF4Reader", ".csv": "CSVReader"}
-#: Formats whose readers a damaged file may crash or hang.
-_APART = ("BLFReader", "MF4Reader")
-#: Endings of log files, before ``.gz``.
-LOG_ENDINGS = (".log", *_PYTHON_CAN)
 #: First bytes of a log: the ending of its format.
 _BEGINNINGS = {
     b"LOGG": ".blf", b"MDF     ": ".mf4", b"UnFinMF ": ".mf4", b";$FILEVERSION": ".trc", b"(": ".log", b"date ": ".asc",
@@ -86,12 +78,11 @@ def unpack(path: Path, raw: bytes) -> bytes:
     packer, opened = next((how for beginning, how in _PACKED.items() if raw.startswith(beginning)), ("", None))
     if opened is None:
         return raw
-    if isal_zlib and packer == "gzip":
-        # For a file that is not one complete stream, zlib says what is wrong and how much can be read.
-        unpacker = isal_zlib.decompressobj(zlib.MAX_WBITS | 16)
-        with contextlib.suppress(isal_zlib.error):
-            content = unpacker.decompress(raw, _most_bytes())
-            if unpacker.eof and not unpacker.unused_data:
+    if packer == "gzip":
+        # For a file that is not one complete stream, Python's module says what is wrong and how much can be read.
+        with contextlib.suppress(InputError):
+            content, complete = inflate(raw, zlib.MAX_WBITS | 16, _most_bytes())
+            if complete:
                 return content
     parts, left = [], _most_bytes()
     try:
@@ -132,7 +123,11 @@ class Recorded:
         return [self.octets[start:end].tobytes() for start, end in zip(starts[rows], ends[rows], strict=True)]
 
 
-def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]:
+#: Of a log's content: frames, payloads, and what gives the channels, as of `Recorded`.
+_Parsed = tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]
+
+
+def _candump(path: Path, text: bytes) -> _Parsed:
     octets = np.zeros(len(text) // 2, np.uint8)
     frames, bad_line, unfinished = parse_candump(text, octets)
     if bad_line and unfinished and bad_line > 1:
@@ -148,18 +143,47 @@ def _candump(path: Path, text: bytes) -> tuple[np.ndarray, np.ndarray, Callable[
     return frames, octets, channels
 
 
-def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarray, np.ndarray, Callable[[], np.ndarray]]:
-    if reader_name == "TRCReader":
-        content = tidied_trace(content)
+def _blf(path: Path, content: bytes) -> _Parsed:
+    frames, octets, channels, cut = read_blf(path, content, _most_bytes())
+    if cut:
+        print(f"{path}: cut off, read up to there ({len(frames)} frames)", file=sys.stderr)
+    return frames, octets, lambda: channels.astype(str)
+
+
+def _mf4(path: Path, content: bytes) -> _Parsed:
     try:
-        if reader_name in _APART:
-            frames, octets, channels = frames_apart(path, content, reader_name, 2 * _most_bytes())
-        else:
-            frames, octets, channels = frames_of(content, reader_name)
-    except InputError:
-        raise
+        columns = mdf_columns(path, content, 2 * _most_bytes())
     except ImportError as error:
         raise needs_extra(path, error) from None
+    if not columns:
+        raise InputError(f"{path}: holds no frames; a measurement's channels need a mapping without dbc")
+    octets, frames = columns["octets"], np.zeros(len(columns["time_ns"]), FRAME)
+    there = np.arange(octets.shape[1]) < columns["length"][:, None]
+    data = np.zeros((len(frames), 8), np.uint8)
+    width = min(8, octets.shape[1])
+    data[:, :width] = np.where(there, octets, 0)[:, :width]
+    frames["data"] = data.view("<u8")[:, 0]
+    for name in ("time_ns", "can_id", "length"):
+        frames[name] = columns[name]
+    for name, flag in (("extended", EXTENDED), ("remote", REMOTE), ("error", ERROR), ("fd", FD)):
+        frames["flags"] |= columns[name] * np.uint8(flag)
+    return frames, octets[there], lambda: columns["channel"].astype(str)
+
+
+def _python_can(reader_name: str, path: Path, content: bytes) -> _Parsed:
+    import can
+    from can.io.generic import TextIOMessageReader
+
+    if reader_name == "TRCReader":
+        content = tidied_trace(content)
+    kind, file, octets, rows, channels = getattr(can, reader_name), io.BytesIO(content), bytearray(), [], []
+    try:
+        for message in kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file):
+            octets += message.data
+            # Its reader numbers from zero what the tools number from one.
+            channels.append(str(message.channel + 1 if reader_name == "ASCReader" else message.channel))
+            rows.append(row_of(message, round(message.timestamp * 1e9)))
+        frames = np.array(rows, FRAME)
     except Exception as error:
         if reader_name == "CSVReader" and not content.startswith(_CSV):
             # What its reader says is about columns of its own, which this text has not.
@@ -170,7 +194,20 @@ def _python_can(path: Path, content: bytes, reader_name: str) -> tuple[np.ndarra
             ) from None
         text = str(error) or type(error).__name__
         raise InputError(f"{path}: not readable by python-can's {reader_name}: {text}") from None
-    return frames, octets, lambda: channels
+    return frames, np.frombuffer(octets, np.uint8), lambda: np.array(channels)
+
+
+#: What parses a log, by the ending of its format.
+_PARSERS: dict[str, Callable[[Path, bytes], _Parsed]] = {
+    ".log": _candump,
+    ".blf": _blf,
+    ".mf4": _mf4,
+    ".asc": partial(_python_can, "ASCReader"),
+    ".trc": partial(_python_can, "TRCReader"),
+    ".csv": partial(_python_can, "CSVReader"),
+}
+#: Endings of log files, before ``.gz``.
+LOG_ENDINGS: tuple[str, ...] = tuple(_PARSERS)
 
 
 def ids_in(frames: np.ndarray) -> str:
@@ -218,9 +255,7 @@ def read_log(path: str | Path) -> Recorded:
     if ending not in LOG_ENDINGS:
         known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
         raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns (without dbc)")
-    parsed = _candump(path, content) if ending == ".log" else _python_can(path, content, _PYTHON_CAN[ending])
-    frames, octets, channels = parsed
+    frames, octets, channels = _PARSERS[ending](path, content)
     if not len(frames):
-        hint = "; a measurement's channels need a mapping without dbc" if ending == ".mf4" else ""
-        raise InputError(f"{path}: holds no frames{hint}")
+        raise InputError(f"{path}: holds no frames")
     return Recorded(frames, octets, hashlib.sha256(raw).hexdigest(), channels)

@@ -6,7 +6,9 @@ million samples, most of it zeros, is never stored.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
@@ -43,7 +45,8 @@ class Block:
     """Residuals of one log.
 
     Attributes:
-        residual: from values by key (those in ``keys`` at least) to residuals, shape (n,), all finite.
+        residual: from values by key (those in ``keys`` at least) to residuals, shape (n,), all finite. Those of several blocks
+            are asked at once.
         keys: parameters that these residuals depend on; only they are moved for the derivative.
         episode: number of the episode of each residual, ascending, shape (n,). Residuals are autocorrelated within an episode
             and nearly independent between episodes, so that the covariance is computed over episodes.
@@ -142,6 +145,8 @@ class _Problem:
 
     def __init__(self, blocks, free):
         self.blocks, self.free = blocks, free
+        # Kernels let other threads run.
+        self.map = ThreadPoolExecutor(2).map if len(blocks) > 1 else map
         self.keys = tuple(free)
         row = {key: index for index, key in enumerate(self.keys)}
         self.columns = [np.array([row[key] for key in block.keys], int) for block in blocks]
@@ -167,11 +172,11 @@ class _Problem:
 
     def residuals(self, x):
         values = self.values(x)
-        return [block.residual(values) for block in self.blocks]
+        return list(self.map(lambda block: block.residual(values), self.blocks))
 
     def derivatives(self, x):
         """Residuals and their derivatives by the searched vector, for each block."""
-        return [self._derivative(x, number) for number in range(len(self.blocks))]
+        return list(self.map(partial(self._derivative, x), range(len(self.blocks))))
 
     def _derivative(self, x, number):
         block, columns = self.blocks[number], self.columns[number]
