@@ -301,6 +301,17 @@ def test_frames_without_room_are_counted_beside_their_stamps():
         assert 0 < heard < 200 and bus.dropped == 200 - heard
 
 
+def test_waiting_ends_with_the_first_frame():
+    near, far = socket_pair()
+    frames = np.zeros(1, FRAME)
+    frames["can_id"], frames["length"] = 0x123, 8
+    assert not far.wait(0.01)
+    near.send(frames)
+    assert far.wait(1.0) and not far.wait(0.0)
+    near.close()
+    far.close()
+
+
 def test_a_peer_that_is_gone_sends_nothing():
     """The end of a socket pair reads as empty messages for ever."""
     near, far = socket_pair()
@@ -362,8 +373,10 @@ def test_a_corner_that_cannot_be_estimated_is_no_reason_to_restart_the_others(dr
 def test_a_change_is_logged_as_its_corners(driven, caplog, corner, name):
     estimate = driven.daemon.pipeline.estimates[0]
     estimate["corner"], estimate["mode"], estimate["reasons"], estimate["facts"] = corner, r.DEGRADED, r.STUCK, 0
+    driven.daemon._estimated = 0
     for _ in range(2):
         driven.daemon._follow(1, driven.pacer)
+    assert driven.daemon._estimated == 1 << corner
     assert caplog.text.count("corner") == caplog.text.count(f"corner {name}: degraded (signal stuck)\n") == 1
     estimate["reasons"], estimate["facts"] = r.OUT_OF_RANGE, ZERO_WANDERS | WHEEL_CONTRADICTED
     driven.daemon._follow(1, driven.pacer)
