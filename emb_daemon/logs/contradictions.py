@@ -153,7 +153,7 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
     """A line if the current accelerates the motor of SAMPLE rows as if its inertia were far from the one stated: then angle or
     current is in another unit, of another place, or of another motor."""
     speed, current, acceleration, angle = _in_motion(samples, samples["angle"].astype(float))
-    if not np.ptp(angle, initial=0.0):
+    if not len(angle) or not np.ptp(angle):
         return []
     way = (angle - angle[0]) / np.ptp(angle)
     known = np.column_stack([np.ones(len(way)), np.sign(speed), speed, way, way**2, way**3])
