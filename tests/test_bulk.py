@@ -139,6 +139,16 @@ def test_a_blf_that_was_cut_off_is_read_up_to_there(tmp_path, monkeypatch, capsy
         assert len(frames) > 0.8 * len(whole) * (size - len(content) / 4) / len(content)
 
 
+def test_a_blf_that_was_cut_off_between_objects_is_said_to_be(tmp_path, capsys):
+    """In the header of its next container, or in one of which all but the end of its stream is there."""
+    rng = np.random.default_rng(2)
+    first, second = (_container(b"".join(_object(_CAN, rng, number) for number in range(9)), True) for _ in range(2))
+    for name, content in (("a.blf", first + second[:20]), ("b.blf", first + second[:-5])):
+        (tmp_path / name).write_bytes(_file(content))
+        assert len(read_frames(tmp_path / name)) == (9 if name == "a.blf" else 18)
+        assert "cut off" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
