@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zlib
 from itertools import pairwise
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -139,6 +140,16 @@ def test_a_blf_that_was_cut_off_is_read_up_to_there(tmp_path, monkeypatch, capsy
         assert len(frames) > 0.8 * len(whole) * (size - len(content) / 4) / len(content)
 
 
+def test_a_blf_that_was_cut_off_between_objects_is_said_to_be(tmp_path, capsys):
+    """In the header of its next container, or in one of which all but the end of its stream is there."""
+    rng = np.random.default_rng(2)
+    first, second = (_container(b"".join(_object(_CAN, rng, number) for number in range(9)), True) for _ in range(2))
+    for name, content in (("a.blf", first + second[:20]), ("b.blf", first + second[:-5])):
+        (tmp_path / name).write_bytes(_file(content))
+        assert len(read_frames(tmp_path / name)) == (9 if name == "a.blf" else 18)
+        assert "cut off" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -251,3 +262,17 @@ def test_a_reader_of_mdf4_ends_with_who_asked_it(mdf):
     assert done.returncode == -9
     with contextlib.suppress(psutil.NoSuchProcess):
         psutil.Process(int(done.stdout)).wait(timeout=30)
+
+
+def test_a_remote_frame_of_mdf4_asks_for_bytes_and_has_none():
+    """Some recorders state for it how many it asks for, others write it among the data frames with a flag."""
+    asks = np.zeros(2, [("CAN_RemoteFrame.ID", "u4"), ("CAN_RemoteFrame.DataLength", "u1")])
+    asks["CAN_RemoteFrame.DataLength"] = 8
+    found = apart._frames_of("CAN_RemoteFrame", SimpleNamespace(samples=asks, timestamps=np.zeros(2)))
+    assert found["remote"].all() and found["length"].tolist() == [0, 0]
+    flagged = np.zeros(
+        2, [("CAN_DataFrame.RTR", "u1"), ("CAN_DataFrame.DataLength", "u1"), ("CAN_DataFrame.DataBytes", "u1", 8)]
+    )
+    flagged["CAN_DataFrame.RTR"], flagged["CAN_DataFrame.DataLength"] = [0, 1], 8
+    found = apart._frames_of("CAN_DataFrame", SimpleNamespace(samples=flagged, timestamps=np.zeros(2)))
+    assert found["remote"].tolist() == [False, True] and found["length"].tolist() == [8, 0]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.calibration.parameters import moved
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.fleet import dataset, findings, learning, population, scores
@@ -271,6 +272,8 @@ def test_what_another_estimator_made_is_made_anew(tmp_path, logs, calibration, m
     unit = next(iter(dataset.by_unit(dataset.drives(tmp_path)).values()))
     replay_drive(tmp_path, unit[0], calibration)
     assert is_replayed(tmp_path, unit[0], dataset.made_by(calibration))
+    other = moved(calibration, {"friction.offset_Nm": 1.1 * calibration.friction.offset_Nm})
+    assert not is_replayed(tmp_path, unit[0], dataset.made_by(other))
     scores.score_unit(tmp_path, unit, calibration)
     path = scores.scores_path(tmp_path, unit[0].unit, unit[0].corner)
     assert any(scores.read_scores(path, calibration))
