@@ -175,9 +175,12 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);
     the torque is NaN where it says nothing.
     """
-    # Friction turns over with the motor, not with an angle that is late; the noise of its speed at rest is no motion.
-    noise = _CERTAINLY * p.speed_sigma * sqrt(CYCLE_S * abs(s.late + effects.known_delay(p.effects)))
-    turning = s.ahead - min(max(s.ahead, -noise), noise)
+    # Friction turns over with the motor, not with an angle that is late; the noise of its speed at rest is no motion. Strokes
+    # that begin and end between samples pass for an age of part of a cycle, by the trapezoidal rule: not for half of one.
+    known = effects.known_delay(p.effects)
+    age = known + s.late if s.late > 0.5 * CYCLE_S else known
+    ahead, noise = turned_within(s.lately, age), _CERTAINLY * p.speed_sigma * sqrt(CYCLE_S * abs(age))
+    turning = ahead - min(max(ahead, -noise), noise)
     slid = _slid(s, p, m.angle + turning, m.angle - s.angle, m.dt)
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
