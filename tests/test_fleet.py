@@ -476,14 +476,17 @@ def test_the_study_of_speed_prints_stages_and_what_a_second_worker_gains(logs, m
     monkeypatch.setattr("sys.argv", ["fleet_speed", str(logs / "car0" / "drive.0.log.gz"), "2"])
     fleet_speed.main()
     title, *rows, _, replayed, projected, gain, memory = capsys.readouterr().out.splitlines()
-    assert title.split()[0] == "stage" and [row[:24].strip() for row in rows] == [
+    stages, formats = rows[:8], rows[9:]
+    assert [row.split()[0] for row in formats] == [".log", ".blf", ".mf4"]
+    assert all(float(cell) > 0.0 for row in formats for cell in row.split()[1:])
+    assert title.split()[0] == "stage" and [row[:24].strip() for row in stages] == [
         "unpack", "parse", "check and decode", "estimate", "read columns", "project on all causes", "replay from the file",
         "replay from columns",
     ]  # fmt: skip
-    assert all(float(cell) > 0.0 for row in rows for cell in row[24:].split())
+    assert all(float(cell) > 0.0 for row in stages for cell in row[24:].split())
     told = re.fullmatch(r"2 workers replay (\d+\.\d\d) times as fast as one, and add (\d+\.\d\d) times as fast", gain)
     assert told and all(float(gain) > 0.0 for gain in told.groups())
-    for line, row in ((replayed, rows[-1]), (projected, rows[5])):
+    for line, row in ((replayed, stages[-1]), (projected, stages[5])):
         core_hours, hours = map(float, re.search(r"(\d+\.\d) core-hours; a core-second is (\d+\.\d\d) h", line).groups())
         times = float(row.split()[-1])
         assert core_hours == pytest.approx(10_000 / times, rel=0.01, abs=0.06)
