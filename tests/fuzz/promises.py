@@ -1,6 +1,6 @@
 """Promises of reception and pipeline, held to millions of frames at the speed of compiled code.
 
-Run as ``python tests/fuzz/promises.py [FRAMES] [SEED]``: ten million by default. A simulated drive is taken again and again,
+Run in tests/ as ``python -m fuzz.promises [FRAMES] [SEED]``: ten million by default. A simulated drive is taken again,
 each time with other foreign frames and losses on the bus, drawn from the seed:
 
 - *noise*: frames on any id, none of them with the right protection. Every genuine frame is taken, no other is, and the
