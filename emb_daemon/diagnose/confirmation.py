@@ -95,14 +95,14 @@ def _against(
         return min(rest, key=rest.__getitem__), f"{worse} on {where}"
     if (ruined := _ruined(bench, before, after, main)) and (guilty := _guilty(selection, ruined[1])):
         told, own = ruined
-        rest = {suspect: _both(left_out_errors(selection, suspect), main, own) for suspect in guilty}
+        rest = {suspect: _product(left_out_errors(selection, suspect), main, own) for suspect in guilty}
         worst = min(rest, key=rest.__getitem__)
-        if rest[worst] < _both(after, main, own):
+        if rest[worst] < _product(after, main, own):
             return worst, f"{told} on left-out episodes"
     return None
 
 
-def _both(judged: EpisodeErrors, main: str, own: np.ndarray) -> float:
+def _product(judged: EpisodeErrors, main: str, own: np.ndarray) -> float:
     """A log's ``main`` error, its episodes being the ``own`` ones, times that of all logs, N²: what costs the one by a larger
     factor than it gains all raises it. By mean squares a little gained where the error is large would pay for anything."""
     return judged.rmse(main, weights=own) * judged.rmse(main)

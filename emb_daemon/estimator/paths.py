@@ -175,8 +175,8 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);
     the torque is NaN where it says nothing.
     """
-    # Friction turns over with the motor, not with an angle that is late; the noise of its speed at rest is no motion. Strokes
-    # that begin and end between samples pass for an age of part of a cycle, by the trapezoidal rule: not for half of one.
+    # Friction turns over with the motor, not with an angle that is late; the noise of its speed at rest is no motion. A stop
+    # that is abrupt passes for an age of up to half a cycle (1.8 ms from 140 rad/s): the speed beside it is a mean around it.
     known = effects.known_delay(p.effects)
     age = known + s.late if s.late > 0.5 * CYCLE_S else known
     ahead, noise = turned_within(s.lately, age), _CERTAINLY * p.speed_sigma * sqrt(CYCLE_S * abs(age))
