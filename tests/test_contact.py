@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.models import contact
 from emb_daemon.offline import estimate, load_log
-from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED, TORQUE_ONLY
+from emb_daemon.wire.contract import CONTACT_UNCERTAIN, CYCLE_S, FUSED, TORQUE_ONLY
 from studies.adaptation import false_alarms
 
 #: Where the reference force starts to rise on the simulated rig's logs, rad past the released position; the stroke is the
@@ -76,6 +77,23 @@ def test_an_offset_of_the_current_is_no_contact(parameters):
     rows, _ = brake.samples(p, np.concatenate([approach, approach[::-1]] * 4))
     rows["current_q"] += 0.8
     assert not estimate(brake.noisy(rows, p), p)["engaged"].any()
+
+
+def test_a_clearance_level_that_was_shown_before_the_offset_drifted_raises_no_alarm():
+    """In each of six holds a current sensor drifts by the deviation of its noise, which the filter notices. Six samples of
+    each stroke are in the clearance, eighty strokes before and ten after a hold."""
+    noise, holds = 0.02, 6
+    limit = contact.threshold(0.5, CYCLE_S, CYCLE_S)
+    for seed in range(20):
+        rng, c = np.random.default_rng(seed), np.zeros(1, contact.CONTACT)
+        for hold in range(holds + 1):
+            offset = noise * hold
+            contact.age_level(c[0], noise**2 if hold else 0.0, noise)
+            for _ in range(10 if hold else 80):
+                for torque in rng.normal(offset, noise, 6):
+                    found = contact.watch_closing(c[0], torque, 0.0, 1.0, noise, limit, -5.0, 0.02, offset, 0.1 * noise)
+                    assert found == contact.NOTHING
+                contact.watch_closing(c[0], offset, 0.0, -1.0, noise, limit, -5.0, 0.02, offset, 0.1 * noise)
 
 
 def test_false_alarms_are_rarer_than_one_in_ten_thousand_releases():

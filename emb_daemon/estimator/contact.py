@@ -7,10 +7,12 @@ import numpy as np
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, rest, shift_zero, turned
+from emb_daemon.estimator.unknown import offset_walk
 from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.contact import (
     NOTHING,
     TOO_EARLY,
+    age_level,
     clearance_level,
     clearly_above,
     engaged,
@@ -275,6 +277,7 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
     torque -= learned
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
+    age_level(c, offset_walk(p, s.offset_walk) * m.dt, sigma)
     unsure = hypot(offset_sigma, learned_sigma)
     found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, contact_sigma, offset, unsure)
     # If a change explains the torque, the contact angle is not moved for the same reason.

@@ -167,8 +167,7 @@ def _predict(s, p, m, spread, warmth, known):
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     walked = s.sensitivity[1]
     softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
-    set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, m.dt)
-    walked[OFFSET] += s.offset_walk * m.dt
+    set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, s.offset_walk, m.dt)
     walked[CONTACT] += s.contact_walk * m.dt
     s.straying.gained += walked[CONTACT]
     walked[CONTACT] += s.straying.walked

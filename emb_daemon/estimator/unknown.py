@@ -151,17 +151,25 @@ def set_priors(P: Floats, p: Record) -> None:
 
 
 @njit
+def offset_walk(p: Record, shown: float) -> float:
+    """Variance, (N m)^2/s, that the torque's offset gains: a healthy current sensor's, and what stops have ``shown``."""
+    return sq(torque_offset(p)) / _OFFSET_DRIFTS_S + shown
+
+
+@njit
 def set_walks(
-    walked: Floats, p: Record, x: Floats, P: Floats, winding: float, housing: float, softening: float, power: float, dt: float
-) -> None:
+    walked: Floats, p: Record, x: Floats, P: Floats, winding: float, housing: float, softening: float, power: float,
+    shown: float, dt: float,
+) -> None:  # fmt: skip
     """Variance that each state gains in ``dt`` s while nothing jumps. ``x`` errors and ``P`` their covariance, ``winding`` and
-    ``housing`` heat, ``softening`` what of stiffness the pads' unknown temperature leaves open, W of friction ``power``."""
+    ``housing`` heat, ``softening`` what of stiffness the pads' unknown temperature leaves open, W of friction ``power``,
+    ``shown`` as in `offset_walk`."""
     # What the lags miss is a share of what heat does, not of what it might have done before driving showed it.
     faded = (sq(x[FADE]) + P[FADE, FADE]) * sq(winding) + (sq(x[HOUSING]) + P[HOUSING, HOUSING]) * sq(housing)
     walked[FAST] = walked[NOISE] = walked[FADE] = walked[HOUSING] = walked[GROWTH] = walked[INERTIA] = walked[SLOW] = 0.0
     walked[CONTACT] = sq(p.contact_walk) * dt + sq(_WORN_M_PER_SQRT_J / p.gear_gain) * power * dt
     walked[GAIN] = (sq(_GAIN_WALK_PER_SQRT_S) + sq(_MISSED) * faded / _MISSED_S) * dt
-    walked[OFFSET] = sq(torque_offset(p)) * dt / _OFFSET_DRIFTS_S
+    walked[OFFSET] = offset_walk(p, shown) * dt
     walked[SCALE] = (sq(0.1 * _SCALE_WALK_PER_SQRT_S) + 2.0 * softening * softening / _HEAT_CHANGES_S) * dt
     for i in CREEPS:
         walked[i] = sq(0.1 * _SCALE_WALK_PER_SQRT_S) * dt

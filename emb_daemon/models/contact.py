@@ -11,12 +11,12 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import Record, fields, njit
+from emb_daemon.jit import Record, fields, njit, sq
 
 #: ``rise``, ``shortfall``: summed torque above and below what clearance level and believed force need, in standard deviations
-#: of one sample. ``level``: torque in the clearance, N m, mean of ``samples``. ``early``: torque above that, N m, mean of the
-#: first ``begun`` samples of this stroke. ``excess``: the same, smoothed over the last ``watched`` samples. ``agreed``: number
-#: of closing samples that confirm the contact angle.
+#: of one sample. ``level``: torque in the clearance, N m, known as well as the mean of ``samples``. ``early``: torque above
+#: that, N m, mean of the first ``begun`` samples of this stroke. ``excess``: the same, smoothed over the last ``watched``
+#: samples. ``agreed``: number of closing samples that confirm the contact angle.
 CONTACT = np.dtype(
     [
         *fields("?", "engaged lost confirmed"),
@@ -137,6 +137,13 @@ def clearance_level(state: Record, sigma: float, offset: float, offset_sigma: fl
     if state.samples < _SHOWN:
         return offset, offset_sigma
     return state.level, max(_CORRELATED * sigma / sqrt(state.samples), offset_sigma)
+
+
+@njit
+def age_level(state: Record, walked: float, sigma: float) -> None:
+    """Let the clearance level count for fewer samples of standard deviation ``sigma`` (N m), because the torque's offset has
+    walked since, with variance ``walked`` ((N m)^2)."""
+    state.samples /= 1.0 + state.samples * walked / sq(_CORRELATED * sigma)
 
 
 @njit
