@@ -32,7 +32,7 @@ from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
 #: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
-#: this many seconds between both: 60 turns a second without speed. Standard deviation of such a jump, rad.
+#: this many seconds between both: 12 turns a second without speed. Standard deviation of such a jump, rad.
 SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
 #: Standard deviations of the speed's noise that are certain; and time after which a zero that drifted counts as healed, s: a
 #: car that stands once in a minute shows it.

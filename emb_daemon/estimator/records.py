@@ -128,7 +128,7 @@ STATE = np.dtype(
         *fields("f8", "ahead travel"),
         ("alignment", ALIGNMENT),
         ("wander", WANDER),
-        # Fusion.
+        # Fusion: the first hypothesis, and the others.
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
@@ -142,9 +142,8 @@ STATE = np.dtype(
         *fields("f8", "offset_before offset_age_s offset_walk"),
         # The same of the contact angle beside its anchor, as long as that stays, rad and rad2/s, and its variance then, rad2.
         *fields("f8", "contact_before contact_known contact_age_s contact_walk"),
+        # Scratch of the filter.
         ("sensitivity", "f8", (2, STATES)),
-        # Stiffness over the calibration's, and contact angle that each kelvin of disc temperature over ``growth_start`` (degC)
-        # takes away, rad/K: learned.
         ("gain", "f8", (STATES,)),
         ("current_before", "f8"),
         ("had_current", "?"),
@@ -152,6 +151,8 @@ STATE = np.dtype(
         *fields("f8", "speed_square speed_sigma"),
         ("no_current_s", "f8"),
         ("trusted", "?"),
+        # Contact angle as clearance or torque placed it, rad. Learned: stiffness over the calibration's, and contact angle
+        # that each kelvin of disc temperature over ``growth_start`` (degC) takes away, rad/K.
         *fields("f8", "contact_anchor scale growth growth_start"),
         # Heat of winding and housing: share of what the largest force's current would leave for ever.
         ("winding", "f8"),
@@ -160,9 +161,9 @@ STATE = np.dtype(
         ("straying", STRAYING),
         ("uneven", UNEVEN),
         ("sensor", FORCE_SENSOR),
-        # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
         ("monitor", MONITOR),
         ("wheel", WHEEL),
+        # Heat. What flowed since the last heat step; profiles, and what the estimate tells of them.
         *fields("f8", "heat_time heat_energy heat_travel"),
         ("touching", "?"),
         ("pads", "f8", (2, NODES)),
@@ -188,7 +189,7 @@ STATE = np.dtype(
         ("work", "f8", (4, CHAIN)),
         ("effects", state_record(REGISTRY)),
         # Last answer, which predictions start from.
-        *fields("f8", "fused fused_sigma rate"),
+        *fields("f8", "fused fused_sigma"),
     ],
     align=True,
 )
