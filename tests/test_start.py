@@ -4,6 +4,7 @@ import brake
 import numpy as np
 import pytest
 
+from emb_daemon.models.stiffness import travel_at
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
 
@@ -223,3 +224,23 @@ def test_a_log_at_a_reduced_rate_that_begins_on_the_way_has_its_released_positio
     estimates = estimate(rows, p)
     assert estimates["contact_angle"][len(up)] - p["clearance"] == pytest.approx(0.3, abs=0.2)
     assert estimates["contact_angle"][len(path)] - p["clearance"] == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("begins", ["released", "clamped"])
+def test_what_pads_may_remember_of_a_stop_before_the_start_is_covered_until_they_have_forgotten_it(p, begins):
+    """They relax over three seconds, and the power comes as a stop of a quarter of the largest force ends, or within it."""
+    p["effects"]["second_relaxation"]["share"], p["effects"]["second_relaxation"]["time_constant_s"] = 0.1, 3.0
+    top = p["clearance"] + travel_at(0.25 * p["maximum_force"], p["curve"])
+    up, held, released = top * np.linspace(0.0, 1.0, 100), np.full(2000, top), np.zeros(10_000)
+    rows, force = brake.samples(p, np.concatenate([up, held, up[::-1], released]), creep=(0.1, 3.0))
+    rows["brake_request"][: len(rows) - len(released)] = 4000.0
+    first = len(rows) - len(released) + (25 if begins == "released" else -400)
+    rows, force = brake.noisy(rows, p)[first:], force[first:]
+    rows["dt"][0] = 0.0
+    estimates = estimate(rows, p)
+    open_s = 0.004 * (np.arange(len(rows)) - (len(rows) - len(released)))
+    early, late = (open_s > 0.2) & (open_s < 2.0), open_s > 25.0
+    error = np.abs(estimates["force"] - force)
+    assert error[early].min() > 5.0 * p["stiffness_sigma"]
+    assert _covered(estimates[early], force[early], 2.0) and _covered(estimates, force)
+    assert np.all(estimates["sigma"][late] < 1.1 * p["stiffness_sigma"]) and error[late].max() < p["stiffness_sigma"]

@@ -14,6 +14,7 @@ from emb_daemon.estimator.common import forget_common, weigh_common
 from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
+from emb_daemon.estimator.restart import SNAPSHOT_S
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, Record, Records, entry, hypot, njit, sq
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, INERTIA, OF_THE_MODEL, OFFSET, SCALE
@@ -23,8 +24,6 @@ from emb_daemon.wire import contract as e
 _STANDING_RAD_S = 0.1
 #: Number of pulses that shows a turning wheel: a single one may come from an edge that stands just at the sensor.
 _ROLLED_PULSES = 2
-#: Time between snapshots of the estimator's state: the most that a restart loses.
-_SNAPSHOT_NS = 10_000_000_000
 #: Age of another corner's estimate from which it is not used.
 _SILENT_NS = 100_000_000
 #: Motor travel that counts as motion, and the time without motion after which motion without request has ended.
@@ -310,7 +309,7 @@ def _follow(a, s, p, limits, m, estimate):
     ) / s.factor
     a.time_ns = estimate.time_ns
     parked = m.has_status and m.park_brake == e.PARK_APPLIED
-    if (parked and not a.parked) or a.time_ns - a.snapshot_ns >= _SNAPSHOT_NS:
+    if (parked and not a.parked) or a.time_ns - a.snapshot_ns >= 1e9 * SNAPSHOT_S:
         a.snapshot_ns, a.snapshot_wanted = a.time_ns, True
     a.parked = parked
 

@@ -230,7 +230,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     # At standstill the errors of the friction state, and of a term outside its range, are constant, so that many samples
     # contain no more information than one. So is an error that no model explains, for some stops.
     white += (sq(friction_torque * s.friction_variance) + doubted * doubted) / (DISSOLVING_PER_S * m.dt)
-    white += lasting * lasting * _LASTS_S / m.dt
+    white += lasting * lasting * _LASTS_S / m.dt + sq(leverage * s.memory_sigma)
     slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     to_force(h, s, spread, s.slope, s.force, warmth)
     slope = s.gear_slope
@@ -284,7 +284,7 @@ def fuse(
     if p.sensor.limit > 0.0 and not known:
         hear_sensor(s, p, m, h, spread, warmth, force_before)
     to_force(h, s, spread, s.slope, s.force, warmth)
-    out.stiffness_sigma = sqrt(force_variance(s.covariance, h))
+    out.stiffness_sigma = hypot(sqrt(force_variance(s.covariance, h)), s.memory_sigma)
     out.innovation = out.innovation_sigma = np.nan
     out.torque_sigma = turning_sigma = standing_sigma = np.inf
     if np.isfinite(torque):
@@ -320,7 +320,7 @@ def fuse(
     out.force, out.sigma = mix(s, h, spread, warmth)
     if not known:
         out.force += uneven.applied(s.uneven)
-        out.sigma = hypot(out.sigma, uneven.force_sigma(s.uneven))
+        out.sigma = hypot(out.sigma, hypot(uneven.force_sigma(s.uneven), s.memory_sigma))
         # Error of the travel from the released position by a resolver with a wrong gain.
         out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
         # What the zero strays by until torque has shown it.

@@ -9,7 +9,7 @@ from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
 from emb_daemon.models.lateness import remember, turned_within
-from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
 from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, slid_angle, turned_back, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -27,6 +27,10 @@ FLICKER_RAD = 0.0008
 _CREEP_S = (1.0, 8.0)
 #: A time after which everything has settled, s.
 _LONG_S = 1e6
+#: Share of the largest force that ordinary stops reach: a third of the deceleration that tyres allow.
+_ORDINARY = 0.3
+#: Share of the stiffness path's noise below which what pads may remember counts no more.
+_FORGOTTEN = 0.1
 #: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
 UNCERTAIN_CONTACT_RAD = 0.05
 
@@ -77,6 +81,8 @@ def _deform(s, p, x, dt, factor):
     if variance > UNCERTAIN_CONTACT_RAD * UNCERTAIN_CONTACT_RAD:
         slope = mean_slope(x, sqrt(variance), p.curve)
     drive = effects.static_force(p.effects, s.effects, factor * static, travel, dt)
+    if s.memory_sigma > 0.0:
+        _follow_memory(s, p, factor * static, travel, dt, drive)
     for i in range(len(_CREEP_S)):
         s.held[i] += (1.0 - exp(-dt / _CREEP_S[i])) * (drive - s.held[i])
         slope *= 1.0 - s.creep[i]
@@ -86,6 +92,29 @@ def _deform(s, p, x, dt, factor):
     s.slope = first_order_lag(s.slope, s.drive_slope, factor * slope, dt, relaxation_time)
     s.drive = drive
     s.drive_slope = factor * slope
+
+
+@njit
+def doubt_memory(s: Record, p: Record, rested_s: float) -> None:
+    """What the pads remember is unknown: an ordinary stop may have ended ``rested_s`` s ago, or none. With effects of slow
+    relaxation that is force which neither angle nor torque of a released brake shows."""
+    held = _ORDINARY * p.maximum_force
+    travel = travel_at(held, p.curve)
+    if np.isfinite(travel):
+        effects.static_force(p.effects, s.held_effects, held, travel, _LONG_S)
+        effects.static_force(p.effects, s.held_effects, 0.0, -travel, rested_s)
+        s.memory_sigma = held
+
+
+@njit
+def _follow_memory(s, p, static, travel, dt, drive):
+    """Standard deviation of the force by what the pads may remember: anything from what is believed, ``drive`` N, to what they
+    would if they had been held."""
+    for port in range(len(s.effects.terms.added)):
+        s.held_effects.terms.added[port] = s.effects.terms.added[port]
+    held = effects.static_force(p.effects, s.held_effects, static, travel, dt)
+    sigma = abs(held - drive) / sqrt(3.0)
+    s.memory_sigma = sigma if sigma > _FORGOTTEN * p.stiffness_sigma else 0.0
 
 
 @njit

@@ -188,6 +188,10 @@ STATE = np.dtype(
         ("plate_stuck", "?"),
         ("work", "f8", (4, CHAIN)),
         ("effects", state_record(REGISTRY)),
+        # The same of pads that were held until the start, and standard deviation, N, of the force by what pads remember of the
+        # time before.
+        ("held_effects", state_record(REGISTRY)),
+        ("memory_sigma", "f8"),
         # Last answer, which predictions start from.
         *fields("f8", "fused fused_sigma"),
     ],

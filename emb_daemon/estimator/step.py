@@ -16,7 +16,7 @@ from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
-from emb_daemon.estimator.paths import ONE_CYCLE_S, stiffness_path, torque_path
+from emb_daemon.estimator.paths import ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
@@ -85,6 +85,8 @@ def _start(s, p, m):
             s.covariance[SCALE, SCALE] = 0.0
             for i in CREEPS:
                 s.covariance[i, i] = 0.0
+        else:
+            doubt_memory(s, p, 0.0)
     s.gear_zero = m.angle
     # A motor that turns already comes from where nobody knows.
     s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf
