@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.jit import njit
 from emb_daemon.logs.columns import DEPTHS_MM
 from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, growth, motor_angle, move_motor, static_angle
@@ -15,7 +16,6 @@ from emb_daemon.plant.records import (
     CAR,
     CYCLE_NS,
     HISTORY,
-    PAD_DEPTHS_M,
     PLANT,
     PLANT_STATE,
     SUBSTEP_S,
@@ -238,8 +238,8 @@ def _reference_frames(w, rng, row, frames, count, slow):
     if slow:
         for side in range(2):
             payload = np.uint64(0)
-            for index in range(len(PAD_DEPTHS_M)):
-                reading = pad_at(p, s, side, PAD_DEPTHS_M[index]) + p.temperature_noise * rng.standard_normal()
+            for index in range(len(DEPTHS_M)):
+                reading = pad_at(p, s, side, DEPTHS_M[index]) + p.temperature_noise * rng.standard_normal()
                 payload |= pack(reading, signal[1 + side, index])
             count = _put(frames, count, sent, can_id[1 + side], payload)
     return count
@@ -254,9 +254,9 @@ def _record(car, p, s, corner, counter, drive, training, truth):
     truth.stiffness_factor, truth.brake_torque = s.stiffness_factor, s.brake_torque
     for side in range(2):
         truth.surface[side], truth.mean[side], truth.plate[side] = s.surface[side], pad_mean(p, s, side), s.plate[side]
-        for index in range(len(PAD_DEPTHS_M)):
-            inside = PAD_DEPTHS_M[index] <= p.pad_thickness
-            truth.depth[side, index] = pad_at(p, s, side, PAD_DEPTHS_M[index]) if inside else np.nan
+        for index in range(len(DEPTHS_M)):
+            inside = DEPTHS_M[index] <= p.pad_thickness
+            truth.depth[side, index] = pad_at(p, s, side, DEPTHS_M[index]) if inside else np.nan
     truth.caliper, truth.disc = s.caliper, s.disc
     truth.wheel_speed, truth.wheel_angle, truth.vehicle_speed = car.wheel_speed, s.wheel_angle, car.speed
     truth.wear, truth.training = s.wear, training.running
