@@ -1,6 +1,7 @@
 """The view on a terminal: five lines for each corner, four corners in 80 x 24."""
 
 import math
+import textwrap
 
 from rich.console import Group
 from rich.text import Text
@@ -33,25 +34,6 @@ def sparkline(values: list[float], width: int, full: float) -> str:
 
 def number(value: float | None, digits: int) -> str:
     return _MISSING if value is None else f"{value:.{digits}f}"
-
-
-def _two_lines(texts: list[str], width: int) -> list[str]:
-    """Texts with commas between them on at most two lines; those without room are counted."""
-    lines, left = [""], list(texts)
-    while left:
-        more = f" … and {len(left)} more"
-        candidate = f"{lines[-1]}, {left[0]}" if lines[-1] else left[0]
-        reserve = len(more) if len(lines) == 2 and len(left) > 1 else 1
-        if len(candidate) + reserve <= width:
-            lines[-1] = candidate
-            left.pop(0)
-        elif len(lines) == 1:
-            lines[-1] += ","
-            lines.append("")
-        else:
-            lines[-1] += more
-            break
-    return [*lines, ""][:2]
 
 
 def _adaptation(request: str | None, progress_percent: int | None, result: str | None) -> Text:
@@ -104,8 +86,8 @@ def corner_lines(corner: Corner, now_ns: int, width: int) -> list[Text]:
     third.append("  ")
     third.append_text(_adaptation(**state["adaptation"]))
 
-    reasons = [Text(f"   {line}", style="yellow") for line in _two_lines(state["reasons"], width - 4)]
-    return [first, second, third, *reasons]
+    reasons = textwrap.wrap(", ".join(state["reasons"]), width - 4, max_lines=2, placeholder=" …")
+    return [first, second, third, *(Text(f"   {line}", style="yellow") for line in [*reasons, "", ""][:2])]
 
 
 def render(listener: Listener, now_ns: int, title: str, width: int, height: int, paused: bool = False) -> Group:

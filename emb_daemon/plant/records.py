@@ -201,8 +201,6 @@ CAR = np.dtype(
         *fields("f8", "speed wheel_speed"),
         # kg carried by the simulated corners, m, N/(m/s)^2, N, m/s^2
         *fields("f8", "mass wheel_radius drag rolling acceleration supply_voltage"),
-        # s; messages leave up to this late after their sample.
-        ("jitter", "f8"),
         ("counter", "i8", (SLOTS,)),
         ("reference", "?"),
     ],

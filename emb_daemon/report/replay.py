@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from emb_daemon.adapt.memory import Entry, Store
 
 #: Shortest interval that is visible on the complete time axis, as a share of it; intervals closer together are drawn as one.
-_SEEN = 1.0 / 1000.0
+_VISIBLE = 1.0 / 1000.0
 _BINS = 120
 _LABELS = {"fused": "estimate", "stiffness": "stiffness path", "torque": "torque path"}
 _STIFFNESS, _TORQUE = Style("#7fa7d1", 1.0), Style("#c2662d", 1.2, "dot")
@@ -37,7 +37,7 @@ def stretches(time_s: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.nd
     begin, end = time_s[np.flatnonzero(edges == 1)], time_s[np.flatnonzero(edges == -1) - 1]
     if not len(begin):
         return begin, end
-    least = max(CYCLE_S, _SEEN * float(time_s[-1] - time_s[0]))
+    least = max(CYCLE_S, _VISIBLE * float(time_s[-1] - time_s[0]))
     apart = np.concatenate([[True], begin[1:] - end[:-1] > least])
     first = np.flatnonzero(apart)
     last = np.concatenate([first[1:] - 1, [len(begin) - 1]])
