@@ -80,6 +80,16 @@ def test_the_catalogue_is_complete():
     assert set(promised.split()) <= {effect.name for effect in REGISTRY}
 
 
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
+def test_an_effect_is_described(effect):
+    assert effect.path in ("stiffness", "torque", "thermal")
+    assert effect.equation and effect.source
+    assert effect.amplitudes, "nothing switches it off"
+    for parameter in effect.parameters:
+        assert parameter.low < parameter.high and parameter.low <= parameter.prior <= parameter.high
+        assert parameter.unit and parameter.meaning
+
+
 #: `plant` is a brake of its own, with effects of its own.
 _MAY_NAME = ("effects", "plant")
 
