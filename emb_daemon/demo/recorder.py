@@ -1,4 +1,4 @@
-"""Records the demonstration: the car's truth, and the daemon's broadcasts as received from the bus."""
+"""Records a drive on a bus: the car's truth, and the daemon's broadcasts as received."""
 
 from dataclasses import dataclass
 
