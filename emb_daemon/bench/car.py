@@ -54,7 +54,7 @@ def main() -> None:
     bus = _Bus(descriptor)
     calibration = load_calibration(resource("config/calibration.yaml"))
     plants = np.array([plant_from_calibration(calibration, seed) for seed in range(corners)])
-    live = LiveCar(Car(plants, CORNERS[:corners], reference=False), bus, city_drive())
+    live = LiveCar(Car(plants, CORNERS[:corners]), bus, city_drive())
     live.warm_up()
     recorder = Recorder(CORNERS[:corners], seconds)
     # Load compiled code now, not while answers are timed.

@@ -26,14 +26,14 @@ def phase(truth: np.void) -> str:
 
 
 def health(recorder: Recorder, daemon: Daemon, live: LiveCar) -> str:
-    """Loop health in one line: time from sample to estimate on the bus, missed periods, late cycles of the car."""
+    """Loop health in one line: time from sample to estimate on the bus, missed ticks, late and lost cycles of the car."""
     responses = recorder.recent_responses()
     if not len(responses):
         return "no estimate yet"
     median, tail = 1e3 * np.percentile(responses, (50, 99))
     return (
-        f"sample to estimate {median:.2f} ms (99 %: {tail:.2f} ms) · daemon {daemon.ticks} ticks, {daemon.missed} missed"
-        f" · car {live.late} cycles late, {live.lost} lost"
+        f"answered in {median:.2f} ms (99 %: {tail:.2f}) · {daemon.missed} of {daemon.ticks} ticks missed"
+        f" · car {live.late} late, {live.lost} lost"
     )
 
 
