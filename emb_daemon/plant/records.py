@@ -1,4 +1,4 @@
-"""Records of the plant. SI units, temperatures in degC; every field of a table states its unit and meaning."""
+"""Records of the plant. SI units, temperatures in degC; parameters state their unit and meaning."""
 
 from typing import NamedTuple
 
