@@ -185,7 +185,7 @@ def _write_report(arguments: argparse.Namespace, results: list, corner: str, cal
 
     described = f"{arguments.calibration or 'the shipped one'}, {calibration.actuator}, {calibration_hash(calibration)}"
     learned = Memory(arguments.state).read(corner) if arguments.state else None
-    replay_page(results, corner, described, learned, calibration).write(arguments.report)
+    replay_page(results, corner, calibration, described, learned).write(arguments.report)
 
 
 def _print(report: dict) -> None:

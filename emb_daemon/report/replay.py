@@ -197,15 +197,13 @@ def _curve(name: str, coefficients: np.ndarray, top_N: float, style: Style) -> T
 
 
 def replay_page(
-    results: Sequence[Result], corner: str, described: str, learned: "Store | None" = None,
-    calibration: Calibration | None = None,
-) -> Page:  # fmt: skip
+    results: Sequence[Result], corner: str, calibration: Calibration, described: str, learned: "Store | None" = None
+) -> Page:
     """The page of one or more `replay.Result`, in sequence as one drive.
 
     Args:
-        described: the calibration, in words.
+        calibration: of the file; ``described`` in words.
         learned: `adapt.memory.Store` of the corner after the drive, if it adapts.
-        calibration: the one with which the learned values are compared.
     """
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
