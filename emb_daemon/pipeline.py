@@ -176,9 +176,9 @@ class Pipeline:
         else:
             answer(self.samples, count, self.states, self.parameters, self.estimates)
 
-    def consume(self, frames: np.ndarray, start: int = 0, predictions: bool = True) -> tuple[int, int]:
+    def consume(self, frames: np.ndarray, start: int = 0) -> tuple[int, int]:
         """`collect` and `answer`."""
-        start, count = self.collect(frames, start, predictions)
+        start, count = self.collect(frames, start)
         self.answer(count)
         return start, count
 

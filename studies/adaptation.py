@@ -99,7 +99,8 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
                 pipeline.begin(0)
                 estimates, start = [], 0
                 while start < len(frames):
-                    start, count = pipeline.consume(frames, start, predictions=False)
+                    start, count = pipeline.collect(frames, start, predictions=False)
+                    pipeline.answer(count)
                     estimates.append(pipeline.estimates[:count].copy())
                 estimates = np.concatenate(estimates)
                 judged = round(10.0 / CYCLE_S)

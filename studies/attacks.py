@@ -82,7 +82,8 @@ def estimated(frames: np.ndarray, adaptation: Adaptation | None = None) -> np.nd
     """ESTIMATE rows of a corner with the shipped calibration."""
     pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 17, adaptation=adaptation)
     pipeline.begin(int(frames["time_ns"][0]))
-    _, count = pipeline.consume(frames, predictions=False)
+    _, count = pipeline.collect(frames, predictions=False)
+    pipeline.answer(count)
     return pipeline.estimates[:count].copy()
 
 

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -279,8 +280,7 @@ def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, s
 
     def simulated(tried: float) -> tuple[float, np.ndarray]:
         plant = base.copy()
-        for key, value in (values | {"size": tried}).items():
-            plant["effects"][name][key] = value
+        _put(plant, {name: values | {"size": tried}})
         frames, truth = simulate_log(plant, schedule, seed=seed)
         return rmse(Bench([log_of(frames)], start).residuals({})[channel]), truth[:, 0]
 
@@ -303,10 +303,9 @@ def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, s
 
 def amounts(effect: Mapping[str, Mapping[str, float]], truth: np.ndarray) -> np.ndarray:
     """What a drawn effect adds at its port along a drive of one corner, TRUTH (N,), in the port's unit."""
-    [(name, values)] = effect.items()
+    [name] = effect
     plant = np.zeros(1, PLANT)[0]
-    for key, value in values.items():
-        plant["effects"][name][key] = value
+    _put(plant, effect)
     state, result = np.zeros(1, PLANT_STATE)[0], np.empty(len(truth))
     for index, row in enumerate(truth):
         for key in _FOLLOWED:
@@ -323,27 +322,31 @@ def contribution(bench: Bench, name: str, values: dict[str, float]) -> np.ndarra
     return bench.under(with_it).residuals({})[channel] - bench.residuals({})[channel]
 
 
-def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
-    """One blind trial; ``kind`` is null, single, pair, triple, changed, foreign, drawn or heat, ``names`` the effects to hide
-    at ``size`` N (K of heat) each; for a change that of what the calibration says is off."""
-    rng = np.random.default_rng(seed)
-    start = calibration
-    removed = [name for name in names if name in calibration.effects]
-    if removed:
-        start = msgspec.structs.replace(
-            calibration, effects={k: v for k, v in calibration.effects.items() if k not in removed}
-        )
-    base = plant_from_calibration(calibration, seed=seed)
-    for name in removed:
-        base["effects"][name] = 0.0
-    schedule = heat_campaign(base, rng) if kind == "heat" else campaign(base, rng, stops)
-    hidden: dict[str, dict[str, float]] = {}
+def _put(plant: np.void, effects: Mapping[str, Mapping[str, float]]) -> None:
+    """Give a PLANT record effects with their parameters."""
+    for name, values in effects.items():
+        for key, value in values.items():
+            plant["effects"][name][key] = value
+
+
+def _draw_hidden(
+    base: np.void,
+    schedule: Schedule,
+    start: Calibration,
+    rng: np.random.Generator,
+    seed: int,
+    kind: str,
+    names: tuple[str, ...],
+    size: float,
+) -> dict[str, dict[str, float]]:
+    """What a trial hides (`run_trial`), of ``size`` each."""
     if kind in ("drawn", "heat"):
         family = _FAMILY if kind == "drawn" else _HEAT_FAMILY
-        hidden = draw_sized(base, schedule, start, np.random.default_rng(seed), size, seed, family)
-    elif kind == "foreign":
-        hidden[names[0]] = dict(_FOREIGN[names[0]])
-    elif names:
+        return draw_sized(base, schedule, start, np.random.default_rng(seed), size, seed, family)
+    if kind == "foreign":
+        return {names[0]: dict(_FOREIGN[names[0]])}
+    hidden: dict[str, dict[str, float]] = {}
+    if names:
         frames, _ = simulate_log(base, schedule, seed=seed)
         bench = Bench([log_of(frames)], start)
         for name in names:
@@ -352,33 +355,39 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
             for _ in range(2):
                 values = scaled(name, values, size / max(rmse(contribution(bench, name, values)), 1e-9))
             hidden[name] = values
+    return hidden
+
+
+def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
+    """One blind trial; ``kind`` is null, single, pair, triple, changed, foreign, drawn or heat, ``names`` the effects to hide
+    at ``size`` N (K of heat) each; for a change that of what the calibration says is off."""
+    rng = np.random.default_rng(seed)
+    removed = [name for name in names if name in calibration.effects]
+    kept = {name: values for name, values in calibration.effects.items() if name not in removed}
+    start = msgspec.structs.replace(calibration, effects=kept) if removed else calibration
+    base = plant_from_calibration(calibration, seed=seed)
+    for name in removed:
+        base["effects"][name] = 0.0
+    draw_campaign = heat_campaign if kind == "heat" else partial(campaign, stops=stops)
+    schedule = draw_campaign(base, rng)
+    hidden = _draw_hidden(base, schedule, start, rng, seed, kind, names, size)
     if kind == "changed":
         [(name, off)] = hidden.items()
         factor = rng.choice(_CHANGES)
         was = scaled(name, off, 1.0 / abs(factor - 1.0))
         hidden[name] = scaled(name, was, factor)
         start = moved(start, {f"effects.{name}.{key}": value for key, value in was.items()})
-        for key, value in was.items():
-            base["effects"][name][key] = value
+        _put(base, {name: was})
     plant = base.copy()
-    for name, values in hidden.items():
-        for key, value in values.items():
-            plant["effects"][name][key] = value
-    fit_frames, _ = simulate_log(plant, schedule, seed=seed + 1)
-    judging = heat_campaign(plant, rng) if kind == "heat" else campaign(plant, rng, stops)
-    val_frames, _ = simulate_log(plant, judging, seed=seed + 2)
-    fit_log, val_log = log_of(fit_frames), log_of(val_frames)
+    _put(plant, hidden)
+    fit_log = log_of(simulate_log(plant, schedule, seed=seed + 1)[0])
+    judging = draw_campaign(plant, rng)
+    val_log = log_of(simulate_log(plant, judging, seed=seed + 2)[0])
     begin = time.process_time()
     result = diagnose([fit_log], start, [val_log])
     seconds = time.process_time() - begin
-    left = result.unexplained
     new = [f for f in result.accepted if not f.in_calibration]
     found = {f.effect.name: {key: float(value) for key, value in f.values.items()} for f in new}
-    error = None
-    if kind in ("single", "pair", "triple") and set(found) == set(hidden):
-        bench = Bench([val_log], start)
-        true = {name: contribution(bench, name, values) for name, values in hidden.items()}
-        error = max(rmse(contribution(bench, name, found[name]) - true[name]) / rmse(true[name]) for name in hidden)
     return Trial(
         seed,
         kind,
@@ -387,14 +396,22 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         found,
         result.before.rmse("fused"),
         result.after.rmse("fused"),
-        left.strongest.signal if left and left.strongest else None,
-        error,
+        result.unexplained.strongest.signal if result.unexplained and result.unexplained.strongest else None,
+        _contribution_error(Bench([val_log], start), kind, hidden, found),
         seconds,
         what_is_left(result, base, judging, seed + 2),
         tuple(f.effect.name for f in result.accepted if f.in_calibration),
         result.judged_residual.get("temperature"),
         {f.effect.name: [":".join(["term", port, *signals]) for port, signals in f.alike] for f in new if f.alike},
     )
+
+
+def _contribution_error(bench: Bench, kind: str, hidden: dict, found: dict) -> float | None:
+    """`Trial.contribution_error`, on the log of ``bench``."""
+    if kind not in ("single", "pair", "triple") or set(found) != set(hidden):
+        return None
+    true = {name: contribution(bench, name, values) for name, values in hidden.items()}
+    return max(rmse(contribution(bench, name, found[name]) - true[name]) / rmse(true[name]) for name in hidden)
 
 
 def what_is_left(result: Diagnosis, plant: np.void, schedule: Schedule, seed: int) -> dict[str, Rest]:

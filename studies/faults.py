@@ -588,7 +588,7 @@ def wheel_speed_zero(rng, moments, size):
 
 
 #: What brake and calibration both have of disc thickness variation where the wheel's phase is the question, um.
-_VARIATION = dict.fromkeys((field.name for field in EFFECTS["disc_thickness_variation"]), 0.0)
+_VARIATION = dict.fromkeys(EFFECTS["disc_thickness_variation"], 0.0)
 _VARIATION |= {"order_1_cosine_um": 12.0, "order_1_sine_um": 5.0, "order_2_cosine_um": 4.0}
 _KNOWN_VARIATION = {"disc_thickness_variation": _VARIATION}
 

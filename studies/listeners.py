@@ -1,6 +1,6 @@
-"""What does the loop pay for those who listen? Ticks of four corners alone; while estimates are shared and nobody reads them;
-beside another simulated car and its daemon; and the same with all that listens: a measurement over XCP, a workshop's UDS
-server, the monitor's page with a browser's stream of it, and its recording.
+"""What listeners cost the daemon's loop: ticks of four corners alone; with shared estimates that nobody reads; beside another
+simulated car and its daemon; and the same with all listeners: a measurement over XCP, a workshop's UDS server, the monitor's
+page with a browser's stream of it, and its recording.
 
 ``python -m studies.listeners ROUNDS SECONDS``, the four in turn. The measured daemon is the bench's, on a bus of its own, at
 its priority; monitor and UDS server hear the other car over UDP multicast. What they cost is the fourth against the third, so
@@ -24,7 +24,7 @@ import numpy as np
 from emb_daemon.bench.loop import measure_loop
 from emb_daemon.resources import shipped_configuration
 from emb_daemon.wire.layout import CORNERS
-from studies.xcp import _MEASURED, Master
+from studies.xcp import MEASURED, Master
 
 #: More of the 99 % quantile of a tick than this, µs, is more than asked.
 _ASKED_US = 5.0
@@ -52,7 +52,7 @@ def _measure(port: int, share: Path, stop: threading.Event, packets: list[int]) 
     while not stop.is_set():
         # The server may not be at work yet.
         with suppress(TimeoutError):
-            master.measure(_MEASURED)
+            master.measure(MEASURED)
             while not stop.is_set():
                 master.hear()
     packets.append(sum(master.packets.values()))

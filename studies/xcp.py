@@ -1,8 +1,8 @@
-"""Does a measurement tool get every estimate? The real daemon and a simulated car on a bus, the XCP server beside them, and a
-master of a hundred lines of its own that measures four corners at 250 Hz.
+"""Whether a measurement tool gets every estimate: the real daemon and a simulated car on a bus, the XCP server beside them,
+and a small master that measures four corners at 250 Hz.
 
 ``python -m studies.xcp SECONDS``. Counted are rows that the daemon has written, data packets that came, gaps of the packet
-counter and overloads that the server told; and what the writing costs the loop. Exit status 1 if one packet is missing.
+counter and overloads that the server reported; and what the writing costs the loop. Exit status 1 if one packet is missing.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from emb_daemon.runtime.shared import SHARED, SharedEstimates
 from emb_daemon.wire.layout import CORNERS
 from emb_daemon.workshop.image import address_of
 
-_MEASURED = ("angle_rad", "clamp_force_N", "clamp_force_sigma_N", "torque_force_N", "mode", "reasons")
+MEASURED = ("angle_rad", "clamp_force_N", "clamp_force_sigma_N", "torque_force_N", "mode", "reasons")
 _NAMES = [signal.name for signal in INPUTS + OUTPUTS]
 
 
@@ -149,7 +149,7 @@ def _judge(port: int, share: Path, seconds: float) -> int:
             # Each time anew: a daemon that had to compile starts a second time.
             written = np.memmap(share, np.int64, "r", SHARED.fields["written"][1], (1,))
     master = Master(port)
-    master.measure(_MEASURED)
+    master.measure(MEASURED)
     begin, first = time.monotonic(), int(written[0])
     while time.monotonic() - begin < seconds:
         master.hear()
@@ -162,7 +162,7 @@ def _judge(port: int, share: Path, seconds: float) -> int:
     print(f"{seconds:g} s: {rows} rows written, {came} packets came, {came / seconds / len(CORNERS):.2f} a second and corner")
     print(f"lost: {master.gaps} by the packet counter, {master.overloads} overloads")
     print(f"steps of the time stamps, ms: median {np.median(steps) / 1e3:.3f}, longest {steps.max() / 1e3:.1f}")
-    print("telling four rows costs the loop {:.2f} µs (median), {:.2f} µs (99 %)".format(*cost_us()))
+    print("writing four rows costs the loop {:.2f} µs (median), {:.2f} µs (99 %)".format(*cost_us()))
     # Packets that were on their way at begin and end.
     complete = abs(came - rows) <= 64
     return int(bool(master.gaps or master.overloads or not complete))

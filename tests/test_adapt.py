@@ -871,10 +871,12 @@ def test_history_is_bounded_and_a_rejection_changes_nothing_in_use():
     assert decode(encode(store), Store, FORMAT) == store
 
 
-def test_where_the_state_is_kept(tmp_path):
-    assert state_directory("learned", tmp_path, {}) == tmp_path / "learned"
-    assert state_directory("learned", tmp_path, {"STATE_DIRECTORY": "/var/lib/emb_daemon:/other"}).name == "emb_daemon"
-    assert state_directory(None, tmp_path, {}) is None
+def test_where_the_state_is_kept(tmp_path, monkeypatch):
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    assert state_directory("learned", tmp_path) == tmp_path / "learned"
+    assert state_directory(None, tmp_path) is None
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/emb_daemon:/other")
+    assert state_directory("learned", tmp_path).name == "emb_daemon"
 
 
 def test_people_can_look_and_reset(learned, capsys):

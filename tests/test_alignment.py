@@ -52,8 +52,8 @@ def _compare(shown, needed, a=None, noise=_NOISE):
     a["angle"][0] = 1.0
     for one, other in zip(shown + noise, needed, strict=True):
         compare(a, one, other, 0.0, _NOISE)
-    assert 0.0 in (a["late"], a["slow"])
-    return float(a["late"] + a["slow"])
+    assert 0.0 in (a["delay_left"], a["lag_left"])
+    return float(a["delay_left"] + a["lag_left"])
 
 
 @pytest.mark.parametrize("cycles", [-2.0, -1.0, 1.0, 2.0, 2.2, 3.0])
@@ -68,7 +68,7 @@ def test_a_shift_is_found(cycles):
 def test_a_filter_is_found(cycles, seed):
     a, (shown, needed) = np.zeros(1, ALIGNMENT)[0], _apart(_torque(seed=seed), cycles)
     assert _compare(shown, needed, a, 0.0) == pytest.approx(cycles, rel=0.25)
-    assert a["late"] == 0.0
+    assert a["delay_left"] == 0.0
 
 
 @pytest.mark.parametrize("cycles", [-0.4, 0.4])
@@ -79,7 +79,7 @@ def test_a_filter_within_what_the_estimate_allows_for_is_left(cycles):
     pair = (_filtered(torque, cycles), torque) if cycles > 0.0 else (torque, _filtered(torque, -cycles))
     for shown, needed in zip(*pair, strict=True):
         compare(a, shown, needed, 0.0, 0.1 * _NOISE)
-    assert a["told"] > 15.0 and a["slow"] == 0.0
+    assert a["informative"] > 15.0 and a["lag_left"] == 0.0
 
 
 def test_a_noisy_current_beside_a_smooth_motion_is_no_filter_of_the_motion():
@@ -90,7 +90,7 @@ def test_a_noisy_current_beside_a_smooth_motion_is_no_filter_of_the_motion():
         a["angle"][0] = 1.0
         for shown, needed in zip(smooth + noise, smooth, strict=True):
             compare(a, shown, needed, 0.0, _NOISE)
-            assert a["slow"] == 0.0, seed
+            assert a["lag_left"] == 0.0, seed
 
 
 def test_a_filter_that_comes_while_driving_is_found_within_some_strokes():
@@ -98,7 +98,7 @@ def test_a_filter_that_comes_while_driving_is_found_within_some_strokes():
     before, after = torque[:3500], torque[3500:4700]
     assert _compare(*_apart(before, 0.0), a, 0.0) == 0.0
     _compare(*_apart(after, 2.0), a, 0.0)
-    assert a["slow"] == pytest.approx(2.0, rel=0.25)
+    assert a["lag_left"] == pytest.approx(2.0, rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -123,11 +123,11 @@ def test_what_neither_shift_nor_filter_explains_is_none(wrong, seed):
 def test_a_motor_that_stands_tells_nothing_and_one_stroke_tells_enough():
     a = np.zeros(1, ALIGNMENT)[0]
     _compare(np.zeros(500), np.zeros(500), a)
-    assert a["told"] == 0.0
+    assert a["informative"] == 0.0
     a["angle"] = 0.0
     for torque in _torque():
         compare(a, 0.0, torque, 0.0, _NOISE)
-    assert a["told"] == 0.0
+    assert a["informative"] == 0.0
     stroke = np.concatenate((np.zeros(20), np.full(10, 0.6), np.full(10, -0.3), np.full(20, 0.3)))
     assert _compare(_late(stroke, 2.0), stroke, a) == pytest.approx(2.0, abs=0.1)
 
@@ -137,12 +137,12 @@ def test_until_changes_were_seen_to_belong_together_a_torque_that_changed_waits(
     a = np.zeros(1, ALIGNMENT)[0]
     assert aligned(a)
     _compare(np.repeat([0.0, 0.5], [10, 3]), np.repeat([0.0, 0.5], [10, 3]), a)
-    assert a["restless"] > 0.0 and not aligned(a)
-    a["told"], a["restless"] = 5.0, 1.0
+    assert a["unsettled"] > 0.0 and not aligned(a)
+    a["informative"], a["unsettled"] = 5.0, 1.0
     assert not aligned(a)
-    a["told"] = 6.0
+    a["informative"] = 6.0
     assert aligned(a)
-    a["late"] = 1.0
+    a["delay_left"] = 1.0
     assert not aligned(a)
 
 
@@ -150,10 +150,10 @@ def test_samples_of_before_a_gap_are_not_compared():
     a, needed = np.zeros(1, ALIGNMENT)[0], _torque()
     _compare(_late(needed, 2.0), needed, a)
     interrupt(a)
-    told, squares = float(a["told"]), a["square"].copy()
+    told, squares = float(a["informative"]), a["shift_square"].copy()
     _compare(np.ones(8), np.zeros(8), a)
-    assert a["told"] == told
-    np.testing.assert_array_equal(a["square"], squares)
+    assert a["informative"] == told
+    np.testing.assert_array_equal(a["shift_square"], squares)
 
 
 def _moved(names, cycles, by=_late):
@@ -196,7 +196,7 @@ def test_friction_does_not_go_through_a_filter_of_the_motion(parameters, seed):
 def test_a_unit_within_tolerances_is_in_step(parameters, seed):
     a = _after(city.drive(seed, 40.0)[0], parameters)["alignment"]
     # Of what the sums keep, three quarters: 27 samples told.
-    assert (a["delay"], a["late"], a["lag"], a["slow"]) == (0.0, 0.0, 0.0, 0.0) and a["told"] > 15.0
+    assert (a["delay"], a["delay_left"], a["lag"], a["lag_left"]) == (0.0, 0.0, 0.0, 0.0) and a["informative"] > 15.0
 
 
 @pytest.mark.parametrize("cycles", [2.0, 3.0])
@@ -247,12 +247,12 @@ def test_it_is_moved_only_while_the_motor_stands(parameters):
     a, turning = np.zeros(1, ALIGNMENT)[0], int(np.argmax(rows["speed"]))
     for row in rows[: turning + 1]:
         align(a, row)
-    a["late"] = 1.0
+    a["delay_left"] = 1.0
     align(a, rows[turning + 1])
     assert a["delay"] == 0.0
     for row in rows[turning + 2 :]:
         align(a, row)
-    assert (a["delay"], a["late"]) == (1.0, 0.0)
+    assert (a["delay"], a["delay_left"]) == (1.0, 0.0)
 
 
 @pytest.mark.parametrize(("found", "limit"), [(9.0, alignment.LATEST), (-9.0, -alignment.EARLIEST)])
@@ -261,7 +261,7 @@ def test_no_shift_is_beyond_what_frames_and_gateways_make(found, limit):
     m["dt"] = _DT
     for _ in range(8):
         align(a, m)
-    a["late"] = found
+    a["delay_left"] = found
     align(a, m)
     assert a["delay"] == limit
 
@@ -272,9 +272,9 @@ def test_no_filter_is_slower_than_can_be_undone(found):
     m["dt"] = _DT
     for _ in range(8):
         align(a, m)
-    a["slow"] = found
+    a["lag_left"] = found
     align(a, m)
-    assert a["lag"] == np.copysign(alignment.SLOWEST, found) and a["slow"] == 0.0
+    assert a["lag"] == np.copysign(alignment.SLOWEST, found) and a["lag_left"] == 0.0
 
 
 @pytest.mark.parametrize("cycles", [-4.0, 2.0, 6.0])
@@ -350,12 +350,12 @@ def test_pads_are_led_on_by_the_delay_and_the_filter_together(parameters):
 @pytest.mark.parametrize(
     ("field", "value", "told"),
     [
-        ("late", 1.0, True),
+        ("delay_left", 1.0, True),
         ("delay", 3.9, False),
         ("delay", 4.0, True),
         ("delay", -3.0, True),
-        ("slow", 1.0, True),
-        ("slow", -1.0, True),
+        ("lag_left", 1.0, True),
+        ("lag_left", -1.0, True),
         ("lag", 11.0, False),
         ("lag", 12.0, True),
         ("lag", -12.0, True),

@@ -114,12 +114,11 @@ def test_a_drawn_effect_that_no_brake_can_have_is_drawn_again(calibration, monke
     nothing = _hidden("gear_gain", "clamp_force", shape=ONSET)
     beyond = _hidden("stiffness", "disc_speed", exponent=2.6, other="disc_speed")
     usual = _hidden("stiffness", "brake_torque", exponent=0.7)
-    ask = lambda effect: blind.sized(plant, schedule, calibration, effect, 150.0, seed=5)  # noqa: E731
-    assert ask(nothing) is None and ask(beyond) is None
-    draws = iter([nothing, beyond, usual])
+    draws, asked, sized = iter([nothing, beyond, usual]), [], blind.sized
     monkeypatch.setattr(blind, "draw_foreign", lambda rng, family: next(draws))
+    monkeypatch.setattr(blind, "sized", lambda *arguments: asked.append(sized(*arguments)) or asked[-1])
     drawn = blind.draw_sized(plant, schedule, calibration, np.random.default_rng(0), 150.0, seed=5)
-    assert drawn == ask(usual) and 0.0 < drawn["drawn_stiffness"]["size"] < 0.5
+    assert asked == [None, None, drawn] and 0.0 < drawn["drawn_stiffness"]["size"] < 0.5
 
 
 def test_what_a_drawn_effect_adds_is_what_the_plant_says(calibration):

@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 from browserkit import assert_is_drawn, opened, said_by
 
-from emb_daemon.calibration.files import load_calibration
 from emb_daemon.replay import Replay
 from emb_daemon.report.figures import Panel, Trace, time_figure
 from emb_daemon.report.page import Page
 from emb_daemon.report.replay import replay_page
-from emb_daemon.resources import resource
 
 
 @pytest.mark.trial
-def test_a_seven_minute_replay_opens_without_error(rig, tmp_path):
-    replay = Replay(load_calibration(resource("config/calibration.yaml")))
-    page = replay_page([replay.run(rig / "integrated" / "val.log.gz")], "FL", "the shipped one")
+def test_a_seven_minute_replay_opens_without_error(rig, tmp_path, calibration):
+    page = replay_page([Replay(calibration).run(rig / "integrated" / "val.log.gz")], "FL", calibration, "the shipped one")
     html = page.render()
     assert "http" not in re.sub(r"<script>.*?</script>", "", html, flags=re.DOTALL)
     assert assert_is_drawn(html, tmp_path, plots=2)["lines"] >= 15

@@ -23,7 +23,6 @@ from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.records import EFFECTS
 from emb_daemon.plant.scenarios import simulate_log
 from emb_daemon.resources import resource
 from studies.blind import campaign
@@ -72,8 +71,23 @@ def drive(seconds=12.0, wheel_speed=20.0):
 
 
 def test_the_catalogue_is_complete():
-    """The simulated car's own list, written apart, begins with the names that scripts and people rely on."""
-    assert set(list(EFFECTS)[:17]) <= {effect.name for effect in REGISTRY}
+    """The names that scripts and people rely on."""
+    promised = """
+        disc_thickness_variation disc_thermal_expansion pad_wear torque_constant_fade current_offset viscous_friction
+        stribeck_friction friction_asymmetry gear_mesh_ripple cogging_torque stiffness_hysteresis second_relaxation
+        signal_delay backlash friction_coefficient_fade disc_radiation thermocouple_lag
+    """
+    assert set(promised.split()) <= {effect.name for effect in REGISTRY}
+
+
+@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
+def test_an_effect_is_described(effect):
+    assert effect.path in ("stiffness", "torque", "thermal")
+    assert effect.equation and effect.source
+    assert effect.amplitudes, "nothing switches it off"
+    for parameter in effect.parameters:
+        assert parameter.low < parameter.high and parameter.low <= parameter.prior <= parameter.high
+        assert parameter.unit and parameter.meaning
 
 
 #: `plant` is a brake of its own, with effects of its own.

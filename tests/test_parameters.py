@@ -71,9 +71,10 @@ def test_a_step_is_felt_and_stays_in_bounds_on_one_side(key):
     assert found.low <= found.value - found.step or found.value + found.step <= found.high
 
 
-@pytest.mark.parametrize("key", [key for key in _KEYS if parameter(_CALIBRATION, key).low <= 0.0])
-def test_zero_is_a_start_like_any_other(key):
-    assert parameter(moved(_CALIBRATION, {key: 0.0}), key).step > 0.0
+def test_zero_is_a_start_like_any_other():
+    zeros = [key for key in _KEYS if parameter(_CALIBRATION, key).low <= 0.0]
+    assert len(zeros) > 300
+    assert not [key for key in zeros if not parameter(moved(_CALIBRATION, {key: 0.0}), key).step > 0.0]
 
 
 @pytest.mark.parametrize("key", _EFFECT_KEYS)
@@ -175,21 +176,23 @@ def _derived(calibration: Calibration) -> tuple[bytes, bytes]:
     return to_parameters(calibration).tobytes(), to_limits(calibration).tobytes()
 
 
-@pytest.mark.parametrize("key", [*(key for key in _KEYS if key not in _OF_EVALUATION), *_EFFECT_KEYS, "adaptation.enabled"])
-def test_every_key_of_the_file_acts(key):
-    """A key that changes neither the estimator's parameters nor the limits of adaptation is read by nobody."""
+def _acts(key: str) -> bool:
     calibration = _CALIBRATION
     if curve := re.match(r"stiffness\.curves\[(\d)\]", key):
         # A curve acts on pads of about its thickness.
         thickness = calibration.stiffness.curves[int(curve[1])].pad_thickness_mm
         calibration = moved(calibration, {"pad_thickness_mm": thickness + 0.1})
-    if key == "adaptation.enabled":
-        limits = msgspec.structs.replace(calibration.adaptation, enabled=False)
-        changed = msgspec.structs.replace(calibration, adaptation=limits)
-    else:
-        found = parameter(calibration, key)
-        changed = moved(calibration, {key: found.value + found.step})
-    assert _derived(changed) != _derived(calibration)
+    found = parameter(calibration, key)
+    return _derived(moved(calibration, {key: found.value + found.step})) != _derived(calibration)
+
+
+def test_every_key_of_the_file_acts():
+    """A key that changes neither the estimator's parameters nor the limits of adaptation is read by nobody."""
+    read = [key for key in (*_KEYS, *_EFFECT_KEYS) if key not in _OF_EVALUATION]
+    assert len(read) > 400
+    assert not [key for key in read if not _acts(key)]
+    off = msgspec.structs.replace(_CALIBRATION.adaptation, enabled=False)
+    assert _derived(msgspec.structs.replace(_CALIBRATION, adaptation=off)) != _derived(_CALIBRATION)
 
 
 def test_what_is_no_number_is_declared():

@@ -266,7 +266,8 @@ def test_logs_at_a_reduced_rate(car, every):
     frames = np.concatenate([f for cycle in range(0, 40 * every, every) for f in _sliding(1, first=cycle)])
     pipeline = Pipeline(car, ("FL",))
     pipeline.begin(0)
-    _, count = pipeline.consume(frames, predictions=False)
+    _, count = pipeline.collect(frames, predictions=False)
+    pipeline.answer(count)
     assert count == 40
     assert np.allclose(pipeline.samples["dt"][1:40], 0.004 * every)
     assert np.all(np.isfinite(pipeline.estimates["force"][:40])) and np.all(pipeline.estimates["sigma"][:40] > 0.0)

@@ -215,7 +215,8 @@ def merged(*parts):
 def estimates_of(frames, pipeline=None):
     pipeline = pipeline or Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 13)
     pipeline.begin(_START_NS)
-    _, count = pipeline.consume(frames, predictions=False)
+    _, count = pipeline.collect(frames, predictions=False)
+    pipeline.answer(count)
     return pipeline.estimates[:count].copy()
 
 
@@ -757,7 +758,8 @@ def test_a_running_daemon_hears_and_says_what_a_replay_of_its_bus_does(tmp_path)
     assert np.all(believed["flags"] == 0) and np.sum(believed["can_id"] == 0x200) == np.sum(heard["can_id"] == 0x200)
     pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",))
     pipeline.begin(int(log[0]["time_ns"][0]))
-    _, count = pipeline.consume(verifier().verify(np.concatenate(log)), predictions=False)
+    _, count = pipeline.collect(verifier().verify(np.concatenate(log)), predictions=False)
+    pipeline.answer(count)
     assert np.array_equal(answers(believed), answers(pipeline.broadcast(count))) and count == samples
 
 

@@ -38,6 +38,12 @@ def plant():
     return plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed=3)
 
 
+@pytest.fixture(scope="module")
+def moments(plant):
+    """When the parts of a drive begin, s."""
+    return draw_drive(plant, np.random.default_rng(1))[1]
+
+
 @pytest.fixture
 def frames(plant):
     return simulate_log(plant, rest(0.1))[0]
@@ -146,18 +152,16 @@ def test_a_lost_message_is_lost_alone(frames):
 
 
 @pytest.mark.parametrize("name", sorted(FAMILIES))
-def test_every_family_draws_a_fault_within_the_drive(plant, name):
-    moments = draw_drive(plant, np.random.default_rng(1))[1]
+def test_every_family_draws_a_fault_within_the_drive(moments, name):
     for seed in range(5):
         fault = FAMILIES[name](np.random.default_rng(seed), moments, Size())
         assert 0.0 <= fault.onset_s <= moments["park"]
 
 
 @pytest.mark.parametrize("name", sorted(unlisted.FAMILIES))
-def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(plant, frames, name):
+def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(moments, frames, name):
     """Else E2E protection would refuse them, and nothing would be learned of the estimator."""
-    moments, known = draw_drive(plant, np.random.default_rng(1))[1], default_layout()[0]["slot"]
-    frames = frames[known[frames["can_id"]] >= 0]
+    frames = frames[default_layout()[0]["slot"][frames["can_id"]] >= 0]
     for seed in range(5):
         fault, time_s = unlisted.FAMILIES[name](np.random.default_rng(seed), moments, Size()), moments["park"]
         for _ in range(20):
@@ -166,8 +170,8 @@ def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(pl
                 assert crc(int(frame["can_id"]), frame["data"]) == int(frame["data"]) & 0xFF
 
 
-def test_effects_from_no_catalogue_enter_at_every_port(plant):
-    moments, ports = draw_drive(plant, np.random.default_rng(1))[1], set()
+def test_effects_from_no_catalogue_enter_at_every_port(plant, moments):
+    ports = set()
     for seed in range(50):
         changed = plant.copy()
         unlisted.FAMILIES["foreign"](np.random.default_rng(seed), moments, Size()).brake(changed)

@@ -1,4 +1,4 @@
-"""Dynamic stiffness: exact for the time that passed, causal, and the curve when things rest; effects off leave no trace."""
+"""Dynamic stiffness: exact for the time that passed, causal, and the curve when things rest."""
 
 import brake
 import naive
@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.effects import REGISTRY
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, travel_at
 from emb_daemon.offline import estimate
 
@@ -79,38 +78,6 @@ def test_estimates_never_see_the_future(parameters):
     a, b = estimate(rows, p), estimate(other, p)
     assert a[:300].tobytes() == b[:300].tobytes()
     assert not np.array_equal(a["force"][300:], b["force"][300:])
-
-
-@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
-def test_an_effect_at_zero_is_bit_for_bit_neutral(parameters, effect):
-    """Amplitudes at zero, whatever its shape: the same bits as without the effect; at its prior it does something."""
-    p = parameters[0]
-    angle = p["clearance"] + 12.0 + 10.0 * np.sin(np.arange(600) * 0.02 - 2.0)
-    angle = np.concatenate([np.linspace(0.0, angle[0], 100), angle])
-    p["effects"] = np.zeros((), p["effects"].dtype)
-    rows, _ = brake.samples(p, angle)
-    rows["wheel_speed"], rows["wheel_pulse"] = 30.0, np.arange(len(rows)) % 4096
-    rows["inner_backplate"] = rows["outer_backplate"] = 20.0 + 0.2 * np.arange(len(rows))
-    without = estimate(rows, p)
-    for parameter in effect.shapes:
-        p["effects"][effect.name][parameter.name] = parameter.prior
-    with_zero = estimate(rows, p)
-    for name in without.dtype.names:
-        np.testing.assert_array_equal(with_zero[name], without[name], err_msg=name)
-    p["effects"][effect.name] = tuple(parameter.prior for parameter in effect.parameters)
-    at_prior = estimate(rows, p)
-    quantities = ("force", "sigma", "torque_force", "surface", "disc")
-    assert any(not np.array_equal(at_prior[name], without[name], equal_nan=True) for name in quantities)
-
-
-@pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
-def test_an_effect_is_described(effect):
-    assert effect.path in ("stiffness", "torque", "thermal")
-    assert effect.equation and effect.source
-    assert effect.amplitudes, "nothing switches it off"
-    for parameter in effect.parameters:
-        assert parameter.low < parameter.high and parameter.low <= parameter.prior <= parameter.high
-        assert parameter.unit and parameter.meaning
 
 
 def test_travel_is_found_on_either_side_of_a_curves_turn():

@@ -404,55 +404,69 @@ def test_terms_are_few_and_have_names_of_their_own(calibration):
 _REPLAYED = """
 import runpy, sys
 import numpy as np
-effect = runpy.run_path(sys.argv[1])["EFFECT"]
 from emb_daemon.effects.own import extend
-extend(effect)
+samples, *files = sys.argv[1:]
+for found in files[::2]:
+    extend(runpy.run_path(found)["EFFECT"])
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.offline.run import held, run_step
-trace = run_step(np.load(sys.argv[2]), held(to_parameters(load_calibration(sys.argv[3]))))
-np.save(sys.argv[3] + ".npy", np.stack([trace[name] for name in ("force", "torque", "leverage")]))
+for own in files[1::2]:
+    trace = run_step(np.load(samples), held(to_parameters(load_calibration(own))))
+    np.save(own + ".npy", np.stack([trace[name] for name in ("force", "torque", "leverage")]))
 """
 
-
-@pytest.mark.parametrize(
-    "term",
-    [
-        Term(name="term:x", port="gear_friction", signal="motor_angle", shape="harmonic", gate="load", coefficient=0.1,
-             sine=0.05, scale=3.0, centre=1.0, low=-5.0, high=30.0),
-        Term(name="term:x", port="stiffness", signal="clamp_force", memory="slip", shape="odd_power", coefficient=0.03,
-             memory_scale=900.0, low=0.0, high=2e4),
-        Term(name="term:x", port="force", signal="clamp_force", memory="deficit", shape="odd_power", coefficient=500.0,
-             scale=1e4, memory_scale=0.4, low=0.0, high=2e4),
-        Term(name="term:x", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
-             coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0,
-             other="clamp_force", other_high=8e3),
-        Term(name="term:x", port="gear_friction", signal="clamp_force", shape="odd_power", coefficient=0.1, scale=2e4, low=0.0,
-             high=2e4, other="motor_speed", other_high=5.0),
-    ],
-    ids=lambda term: f"{term.memory} {term.other}",
+_EXPORTED = (
+    Term(name="term:x1", port="gear_friction", signal="motor_angle", shape="harmonic", gate="load", coefficient=0.1,
+         sine=0.05, scale=3.0, centre=1.0, low=-5.0, high=30.0),
+    Term(name="term:x2", port="stiffness", signal="clamp_force", memory="slip", shape="odd_power", coefficient=0.03,
+         memory_scale=900.0, low=0.0, high=2e4),
+    Term(name="term:x3", port="force", signal="clamp_force", memory="deficit", shape="odd_power", coefficient=500.0,
+         scale=1e4, memory_scale=0.4, low=0.0, high=2e4),
+    Term(name="term:x4", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
+         coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0,
+         other="clamp_force", other_high=8e3),
+    Term(name="term:x5", port="gear_friction", signal="clamp_force", shape="odd_power", coefficient=0.1, scale=2e4, low=0.0,
+         high=2e4, other="motor_speed", other_high=5.0),
 )  # fmt: skip
-def test_an_exported_effect_is_the_term(term, calibration, tmp_path):
+
+
+def test_an_exported_effect_is_the_term(calibration, tmp_path):
     """By the command, in the form of a file of one's own: the estimator with it gives what it gives with the term."""
-    shipped, own = tmp_path / "term.yaml", tmp_path / "effect.yaml"
-    plain = msgspec.structs.replace(calibration, provenance=None)
-    termed = msgspec.structs.replace(plain, terms=(term,))
-    shipped.write_text(dump_calibration(termed))
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        assert main(["effect", "export", str(shipped), "term:x", "--output", str(tmp_path / "found.py")]) == 0
-    own.write_text(dump_calibration(plain).replace("effects: {}\n", "") + out.getvalue().partition("\n")[2])
-    np.save(tmp_path / "samples.npy", drive(1.5))
-    files = [tmp_path / "found.py", tmp_path / "samples.npy", own]
-    # As plain Python: compiling the estimator anew for one effect more would take longer than everything else here.
+    plain, files, termed = msgspec.structs.replace(calibration, provenance=None), [], []
+    for term in _EXPORTED:
+        shipped, found, own = (tmp_path / f"{term.name[5:]}{ending}" for ending in (".yaml", ".py", "_own.yaml"))
+        termed.append(msgspec.structs.replace(plain, terms=(term,)))
+        shipped.write_text(dump_calibration(termed[-1]))
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            assert main(["effect", "export", str(shipped), term.name, "--output", str(found)]) == 0
+        own.write_text(dump_calibration(plain).replace("effects: {}\n", "") + out.getvalue().partition("\n")[2])
+        files += [found, own]
+    np.save(tmp_path / "samples.npy", _fast_drive())
+    # As plain Python: compiling the estimator anew for a few effects more would take longer than everything else here.
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run([sys.executable, "-c", _REPLAYED, *files], env=environment, capture_output=True, text=True)
+    command = [sys.executable, "-c", _REPLAYED, tmp_path / "samples.npy", *files]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    found = np.load(f"{own}.npy")
-    traces = (run_step(drive(1.5), held(to_parameters(one))) for one in (plain, termed))
-    without, expected = (np.stack([trace[name] for name in ("force", "torque", "leverage")]) for trace in traces)
-    assert any(np.nanmax(np.abs(rows)) > 1e-9 for rows in found - without)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    without, *expected = (_trace(one) for one in (plain, *termed))
+    for term, own, rows in zip(_EXPORTED, files[1::2], expected, strict=True):
+        found = np.load(f"{own}.npy")
+        assert any(np.nanmax(np.abs(apart)) > 1e-9 for apart in found - without), term
+        np.testing.assert_allclose(found, rows, rtol=1e-9, atol=1e-9, err_msg=term.name)
+
+
+def _fast_drive():
+    """Half as long and twice as fast, because plain Python takes milliseconds for each sample."""
+    samples = drive(0.75)
+    samples["angle"] *= 2.0
+    samples["speed"] *= 2.0
+    return samples
+
+
+def _trace(calibration):
+    trace = run_step(_fast_drive(), held(to_parameters(calibration)))
+    return np.stack([trace[name] for name in ("force", "torque", "leverage")])
 
 
 def test_what_a_calibration_says_of_a_term_is_text_in_its_effect_file(calibration, tmp_path):

@@ -68,10 +68,10 @@ _HUBER = 2.5
 _BLOCK = 5
 #: Blocks beyond this many standard deviations are left out of a second round, if they are at most this share of all.
 _FAR, _FEW = 8.0, 0.05
-#: The pads count as changed if fitting a new curve lowers the cost by this much, per correlated block: with three coefficients
-#: noise alone does so once in a thousand trainings (chi-square).
+#: The pads count as changed only if fitting a new curve lowers the cost by this much, per correlated block: with three
+#: coefficients noise alone does so once in a thousand trainings (chi-square).
 _UNCHANGED = 16.0
-#: The same if its forces differ by this many standard deviations of the torque path's lasting error (95 %).
+#: ... and if its forces differ by this many standard deviations of the torque path's lasting error (95 %).
 _LASTING = 2.0
 #: Lags over which the residual's autocorrelation inflates the covariance.
 _LAGS = 12

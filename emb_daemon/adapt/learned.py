@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from emb_daemon.calibration.curves import neighbours
 from emb_daemon.calibration.parameters import CLEARANCE, LOAD_FRICTION, OFFSET_FRICTION, PRESLIDING_ANGLE, moved, value_of
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
@@ -47,23 +48,17 @@ class Evaluation:
     evidence: dict[str, float] = field(default_factory=dict)
 
 
-def _mounted_curves(calibration: Calibration) -> range:
-    """Indices of the curves between which `calibration.types.curve_at` finds that of the mounted pads."""
-    thicknesses = [curve.pad_thickness_mm for curve in calibration.stiffness.curves]
-    upper = int(np.clip(np.searchsorted(thicknesses, calibration.pad_thickness_mm), 1, max(len(thicknesses) - 1, 1)))
-    return range(upper - 1, min(upper + 1, len(thicknesses)))
-
-
 def curve_terms(calibration: Calibration) -> int:
     """Number of coefficients of the curve that a training determines."""
-    return min(len(calibration.stiffness.curves[index].coefficients) for index in _mounted_curves(calibration))
+    curves = calibration.stiffness.curves
+    return min(len(curves[index].coefficients) for index in neighbours(curves, calibration.pad_thickness_mm))
 
 
 def curve_values(calibration: Calibration, coefficients: Sequence[float] | np.ndarray) -> dict[str, float]:
     """Values that make ``coefficients`` the curve of the mounted pads: both curves next to their thickness are set to it."""
-    values = {}
-    for index in _mounted_curves(calibration):
-        for term in range(len(calibration.stiffness.curves[index].coefficients)):
+    curves, values = calibration.stiffness.curves, {}
+    for index in neighbours(curves, calibration.pad_thickness_mm):
+        for term in range(len(curves[index].coefficients)):
             value = float(coefficients[term]) if term < len(coefficients) else 0.0
             values[f"stiffness.curves[{index}].coefficients[{term}]"] = value
     return values
@@ -85,6 +80,7 @@ def why_out_of_bounds(calibration: Calibration, values: dict[str, float]) -> str
     except InputError as error:
         return "; ".join(str(error).splitlines())
     high = calibration.training_force_N
+    friction = calibration.friction.offset_Nm + calibration.friction.load_m_per_rad * high
     own_curve = any(values[key] != value_of(calibration, key) for key in curve_values(calibration, ()))
     least_relative = limits.torque_constant_relative if own_curve else calibration.noise.stiffness_relative
     bounds = [
@@ -93,11 +89,16 @@ def why_out_of_bounds(calibration: Calibration, values: dict[str, float]) -> str
         (
             "friction at full force, N m",
             p["offset_friction"] + p["load_friction"] * high,
-            *_about(calibration.friction.offset_Nm + calibration.friction.load_m_per_rad * high, limits.friction_change),
+            *((1.0 + change) * friction for change in (-limits.friction_change, limits.friction_change)),
         ),
         (STIFFNESS_SIGMA, p["stiffness_sigma"], calibration.noise.stiffness_N, high),
         (STIFFNESS_RELATIVE_SIGMA, p["stiffness_relative_sigma"], least_relative, 1.0),
-        (CLEARANCE, p["clearance"] - calibration.contact.clearance_rad, *_about(0.0, 0.0, limits.clearance_change_rad)),
+        (
+            "change of clearance, rad",
+            abs(p["clearance"] - calibration.contact.clearance_rad),
+            0.0,
+            limits.clearance_change_rad,
+        ),
     ]
     for name, value, low, highest in bounds:
         if not low <= value <= highest:
@@ -106,10 +107,6 @@ def why_out_of_bounds(calibration: Calibration, values: dict[str, float]) -> str
     if any(characteristic_curve(travel, p["curve"])[1] <= 0.0 for travel in travels):
         return "stiffness.curves: the force does not rise with the travel"
     return ""
-
-
-def _about(value: float, share: float, margin: float = 0.0) -> tuple[float, float]:
-    return value * (1.0 - share) - margin, value * (1.0 + share) + margin
 
 
 def _possible_travel(calibration: Calibration) -> tuple[float, float]:

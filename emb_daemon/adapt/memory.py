@@ -9,7 +9,6 @@ import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -71,9 +70,9 @@ def entry_of(outcome: int, evaluation: Evaluation, date: str, ambient_C: float, 
     )
 
 
-def state_directory(configured: str | None, relative_to: Path, environment: Mapping[str, str] = os.environ) -> Path | None:
+def state_directory(configured: str | None, relative_to: Path) -> Path | None:
     """Folder for learned values: systemd's STATE_DIRECTORY, or else the configured one; None if there is neither."""
-    if given := environment.get("STATE_DIRECTORY"):
+    if given := os.environ.get("STATE_DIRECTORY"):
         return Path(given.split(":")[0])
     return relative_to / configured if configured else None
 

@@ -13,6 +13,7 @@ import time
 import numpy as np
 
 from emb_daemon.calibration.files import load_calibration
+from emb_daemon.demo.recorder import Recorder
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.live import LiveCar
@@ -21,9 +22,7 @@ from emb_daemon.plant.scenarios import city_drive
 from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import RawCanSocket
 from emb_daemon.runtime.realtime import settle_memory, use_fifo
-from emb_daemon.wire.contract import PREDICTED
-from emb_daemon.wire.e2e import COUNTER_MODULO
-from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, default_layout, load_database, signal_columns, unpack
+from emb_daemon.wire.layout import CORNERS
 
 #: Time from the beginning of a cycle's computation until its frames leave, as by a timer; independent of how long it takes.
 _COMPUTING_NS = 500_000
@@ -50,50 +49,28 @@ class _Bus:
         self._bus.send(frames)
 
 
-class _Answers:
-    """Time from a sample's last frame to its answer, matched by the InputCounter."""
-
-    def __init__(self):
-        self._sent = np.zeros((len(CORNERS), COUNTER_MODULO), np.int64)
-        self._ids = default_layout()[0]["sent_id"][CLAMP_FORCE].tolist()
-        database, names = load_database(resource("dbc/emb.dbc")), ("InputCounter", "ForceSource")
-        self._counter, self._source = signal_columns(database, f"EMB_{CORNERS[0]}_ClampForce", names)
-        # Compile now, not while answers are timed.
-        unpack(np.uint64(0), self._source)
-        self.latency_us: list[float] = []
-        self.samples = 0
-
-    def note_sent(self, time_ns: int, truth: np.ndarray) -> None:
-        if time_ns:
-            corners = range(len(truth))
-            self._sent[list(corners), truth["counter"]] = time_ns
-            self.samples += len(truth)
-
-    def note_heard(self, frames: np.ndarray) -> None:
-        for frame in frames[np.isin(frames["can_id"], self._ids)]:
-            if unpack(frame["data"], self._source) < PREDICTED:
-                corner, counter = self._ids.index(frame["can_id"]), int(unpack(frame["data"], self._counter))
-                self.latency_us.append((int(frame["time_ns"]) - self._sent[corner, counter]) / 1e3)
-
-
 def main() -> None:
     corners, seconds, priority, descriptor = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
     bus = _Bus(descriptor)
     calibration = load_calibration(resource("config/calibration.yaml"))
     plants = np.array([plant_from_calibration(calibration, seed) for seed in range(corners)])
-    live = LiveCar(Car(plants, CORNERS[:corners], reference=False), bus, city_drive())
+    live = LiveCar(Car(plants, CORNERS[:corners]), bus, city_drive())
     live.warm_up()
-    answers = _Answers()
+    recorder = Recorder(CORNERS[:corners], seconds)
+    # Load compiled code now, not while answers are timed.
+    recorder.compare(0)
     settle_memory()
     use_fifo(priority)
     print("ready", time.process_time(), flush=True)
     bus.wait(300.0)
     bus.drain()
-    live.run(lambda: False, seconds, answers.note_sent, answers.note_heard)
-    latency = np.array(answers.latency_us or [np.nan])
-    result = {"samples": answers.samples, "answered": len(answers.latency_us), "late": live.late, "lost": live.lost}
-    result["in_time"] = int(np.sum(latency <= CYCLE_NS / 1e3))
-    print(json.dumps(result | {"p50_us": float(np.median(latency)), "p99_us": float(np.percentile(latency, 99))}))
+    live.run(lambda: False, seconds, recorder.note_sent, recorder.note_heard)
+    compared = [recorder.compare(row) for row in range(corners)]
+    latency_us = 1e6 * np.concatenate([corner.response_s for corner in compared])
+    result = {"samples": sum(corner.samples for corner in compared), "answered": len(latency_us)}
+    result |= {"late": live.late, "lost": live.lost, "in_time": int(np.sum(latency_us <= CYCLE_NS / 1e3))}
+    median, tail = np.percentile(latency_us, (50, 99)) if len(latency_us) else (np.nan, np.nan)
+    print(json.dumps(result | {"p50_us": float(median), "p99_us": float(tail)}))
 
 
 if __name__ == "__main__":

@@ -43,6 +43,12 @@ def thickness_range(curves: tuple[Curve, ...]) -> tuple[float, float]:
     return max(thicknesses[0] - below, 0.0), thicknesses[-1] + above
 
 
+def neighbours(curves: tuple[Curve, ...], pad_thickness_mm: float) -> range:
+    """Indices of the curves between which that of a pad thickness lies, or of the nearest two beyond; of a single one."""
+    upper = bisect_left(curves, pad_thickness_mm, 1, max(len(curves) - 1, 1), key=lambda curve: curve.pad_thickness_mm)
+    return range(upper - 1, min(upper + 1, len(curves)))
+
+
 def rising_force(coefficients: np.ndarray) -> float:
     """Force in N up to which a characteristic curve rises from contact; infinite if it never falls."""
     if coefficients[0] <= 0.0:
@@ -73,8 +79,7 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
         raise InputError(
             f"pad_thickness_mm: {pad_thickness_mm} is too far from the measured thicknesses; expected {low:g} to {high:g}"
         )
-    upper = bisect_left(curves, pad_thickness_mm, 1, len(curves) - 1, key=lambda curve: curve.pad_thickness_mm)
-    thinner, thicker = curves[upper - 1], curves[upper]
+    thinner, thicker = (curves[index] for index in neighbours(curves, pad_thickness_mm))
     share = (pad_thickness_mm - thinner.pad_thickness_mm) / (thicker.pad_thickness_mm - thinner.pad_thickness_mm)
     below, above = thinner.of_all_terms, thicker.of_all_terms
     used = (below != 0.0) | (above != 0.0)

@@ -10,17 +10,18 @@ from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import GATES, MEMORIES, MOST, PORTS, SHAPES, SIGNALS
 from emb_daemon.errors import InvalidValue
 
-#: Most that a term may do at a port: what would leave nothing of the quantity that it changes. Angles and thickness: a
-#: hundredth of a turn of every gear that clamps, and a tenth of a millimetre. Current: what no sensor is off by. Force: as
-#: `Calibration` says of the largest. Heat: what pads that drag with 10 N m make at 100 rad/s.
+#: Most that a term may add or subtract at a port that is no factor, in the port's unit. A millimetre of thickness or half
+#: a motor turn clamps or opens the brake by itself. Torque: about what the largest force of the shipped brake needs. Current:
+#: beyond the offset of any sensor. Heat: what pads that drag with 10 N m make at 100 rad/s. Forces are not limited here.
 _MOST_AT = {
     "thickness": 1e-3, "motor_angle": 3.0, "torque": 1.0, "force": np.inf, "current": 5.0, "pad_heat": 1e3, "disc_heat": 1e3,
 }  # fmt: skip
+#: Most that it may take from a factor, and add to one that is not in `_GROWS`: a stiffness, a gear gain or a motor constant
+#: twice as large is another machine's.
 _FACTOR = 0.9
-#: ... and the most that may be added to a factor. Friction and times change severalfold with load and warmth, but of three
-#: times as much the term is the larger part, and what it is a factor of has lost its meaning; a stiffness, a gear or a motor
-#: constant twice as large is another machine's. A contact conducts heat nearly in proportion to its pressure, and air at speed
-#: takes tenfold what still air takes.
+#: Most that it may add to these factors. Friction and times change severalfold with load and temperature, but beyond three
+#: times the nominal value the term would be the larger part. A contact conducts heat nearly in proportion to its pressure, and
+#: air at speed takes ten times as much heat as still air.
 _GROWS = {
     "gear_friction": 2.0, "relaxation_time": 2.0, "heat_share": 9.0, "contact_conductance": 9.0, "gap_conductance": 9.0,
     "disc_cooling": 9.0,
@@ -125,8 +126,8 @@ class Term(Struct, kw_only=True):
 
     @property
     def is_held(self) -> bool:
-        """Whether the kernel holds it within its limits: how long its signal stays says what a response reaches, and two
-        signals are hardly at their largest at once."""
+        """Whether the kernel limits it at run time: what a response reaches depends on how long its signal lasts, and two
+        signals are hardly at their largest at once, so that `reach` would be too wide a bound."""
         return self.memory == "response" or self.other is not None
 
     @property
@@ -137,7 +138,7 @@ class Term(Struct, kw_only=True):
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Least and most that it adds inside its range, in the port's unit; always includes zero."""
+        """Least and most that it can add inside its range, in the port's unit; zero lies between them."""
         ends = (self.low, self.high)
         if self.memory == "slip":
             ends = (-1.0, 1.0)

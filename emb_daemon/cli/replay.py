@@ -11,7 +11,7 @@ from emb_daemon.estimator.status import TABLE
 from emb_daemon.resources import resource
 
 #: Least share of a log's samples for a reason or fact in the summary; tables contain all reasons.
-_SEEN = 0.001
+_LEAST_SHARE = 0.001
 EXAMPLE = "emb-daemon replay stop.log.gz --calibration config/calibration.yaml --output estimates.csv"
 
 
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     for note in replay.notes:
         print(note, file=sys.stderr)
     if arguments.calibration:
-        _tell_other_motor(results, calibration.motor)
+        _warn_of_other_motor(results, calibration.motor)
     for result in results if arguments.measured_torque else ():
         if not np.isfinite(result.reference.brake_torque_Nm).any():
             raise InputError(f"{result.path}: no brake torque (BrakeTorqueRef) in it; expected without --measured-torque")
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _calibration(arguments: argparse.Namespace):
-    """The calibration with the pads that are mounted; prints to stderr for what it is none."""
+    """The calibration with the pads that are mounted; prints to stderr if it is none of this brake, or of a brake at all."""
     from emb_daemon.calibration.files import load_calibration
     from emb_daemon.calibration.parameters import moved
 
@@ -102,7 +102,7 @@ def _calibration(arguments: argparse.Namespace):
     return calibration
 
 
-def _tell_other_motor(results, motor):
+def _warn_of_other_motor(results, motor):
     """Print to stderr where current and motion of a log are not those of the calibration's ``motor``."""
     from emb_daemon.logs.contradictions import other_current, other_motor
     from emb_daemon.wire.layout import CORNERS
@@ -185,7 +185,7 @@ def _write_report(arguments: argparse.Namespace, results: list, corner: str, cal
 
     described = f"{arguments.calibration or 'the shipped one'}, {calibration.actuator}, {calibration_hash(calibration)}"
     learned = Memory(arguments.state).read(corner) if arguments.state else None
-    replay_page(results, corner, described, learned, calibration).write(arguments.report)
+    replay_page(results, corner, calibration, described, learned).write(arguments.report)
 
 
 def _print(report: dict) -> None:
@@ -206,9 +206,9 @@ def _print(report: dict) -> None:
 
 
 def _shares(what: str, shares: dict[str, float]) -> None:
-    told = [f"{word} {100.0 * share:.3g} %" for word, share in shares.items() if share >= _SEEN]
-    if told:
-        print(f"  {what}: {', '.join(told)}")
+    listed = [f"{word} {100.0 * share:.3g} %" for word, share in shares.items() if share >= _LEAST_SHARE]
+    if listed:
+        print(f"  {what}: {', '.join(listed)}")
 
 
 def _line(name: str, figures: dict, unit: str) -> None:

@@ -23,11 +23,11 @@ def stop_signals() -> list[bool]:
 
 def serve(server: Server, greeting: str) -> None:
     """Print ``greeting`` and step the server until SIGTERM or SIGINT; print its trouble to standard error when it changes."""
-    stopped, told = stop_signals(), ""
+    stopped, printed = stop_signals(), ""
     print(greeting, flush=True)
     while not stopped:
         server.step()
-        if server.trouble != told:
-            told = server.trouble
-            if told:
-                print(told, file=sys.stderr, flush=True)
+        if server.trouble != printed:
+            printed = server.trouble
+            if printed:
+                print(printed, file=sys.stderr, flush=True)

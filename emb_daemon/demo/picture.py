@@ -33,7 +33,7 @@ def save_picture(recorder: Recorder, path: Path) -> None:
         )
         _draw_force(force, time, truth, comparisons[0], recorder.corners[0])
         _draw_errors(error, comparisons, recorder.corners)
-        _draw_heat(heat, time, truth, *recorder.temperatures(0), recorder.corners[0])
+        _draw_heat(heat, time, truth, *recorder.temperatures(), recorder.corners[0])
         figure.suptitle("emb-daemon demo: clamp force without a force sensor (simulated car, real daemon)", fontsize=12)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=120)

@@ -1,13 +1,11 @@
-"""Records the demonstration: the car's truth, and the daemon's broadcasts as received from the bus."""
+"""Records a drive on a bus: the car's truth, and the daemon's broadcasts as received."""
 
-import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.monitor.listener import Listener
+from emb_daemon.monitor.listener import Corner, Listener
 from emb_daemon.offline.score import figures, share_inside
 from emb_daemon.plant.records import CYCLE_NS, TRUTH
 from emb_daemon.wire.contract import INVALID, STATUS_DEGRADED
@@ -78,18 +76,20 @@ class Recorder:
         self.frame_cycle[self.count : self.count + room] = self.cycles
         self.count += room
 
-    def states(self) -> list[dict[str, Any]]:
-        """Present state by the broadcasts, by corner (`monitor.listener.Corner.state`)."""
+    def present(self, now_ns: int) -> list[Corner]:
+        """The corners as the monitor knows them from their broadcasts so far, with the true force as reference."""
         count = self.count
         self._listener.hear(self.frames[self._listened : count])
         self._listened = count
-        now = time.monotonic_ns()
-        return [self._listener.corners[CORNERS.index(corner)].state(now) for corner in self.corners]
+        corners = [self._listener.corners[CORNERS.index(name)] for name in self.corners]
+        for corner, truth in zip(corners, self.truth[self.cycles - 1], strict=True):
+            corner.refer(truth["force"], now_ns)
+        return corners
 
-    def recent_responses(self, row: int) -> np.ndarray:
-        """Response times (s) of one corner's estimates of the last two seconds or so."""
+    def recent_responses(self) -> np.ndarray:
+        """Response times (s) of the first corner's estimates of the last two seconds or so."""
         start = max(self.count - 1000 * len(self.corners), 0)
-        return self._match(row, start, self.count)[3]
+        return self._match(0, start, self.count)[3]
 
     def _match(self, row: int, start: int, stop: int):
         """(frames of the clamp force, their row in the truth, status, response time in s)."""
@@ -122,12 +122,12 @@ class Recorder:
             samples=int(np.count_nonzero(self.sent_ns)),
         )
 
-    def temperatures(self, row: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Pad temperatures that one corner's daemon broadcast: (time in s, columns in degC), where they were usable."""
+    def temperatures(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Pad temperatures that the first corner's daemon broadcast: (time in s, columns in degC), where they were usable."""
         frames, cycle = self.frames[: self.count], self.frame_cycle[: self.count]
-        columns = Decoder().columns(frames, f"EMB_{self.corners[row]}_PadTemp")
-        cycle = cycle[np.isin(frames["can_id"], self._ids[PAD_TEMP, CORNERS.index(self.corners[row])])]
+        columns = Decoder().columns(frames, f"EMB_{self.corners[0]}_PadTemp")
+        cycle = cycle[np.isin(frames["can_id"], self._ids[PAD_TEMP, CORNERS.index(self.corners[0])])]
         usable = (columns["Status"] <= STATUS_DEGRADED) & (cycle > 0)
         at = cycle[usable] - 1
-        time = 1e-9 * (self.truth["time_ns"][at, row] - self.truth["time_ns"][0, row])
+        time = 1e-9 * (self.truth["time_ns"][at, 0] - self.truth["time_ns"][0, 0])
         return time, {name: values[usable] for name, values in columns.items()}

@@ -156,10 +156,11 @@ def _run_with_view(session: Session, console: "Console", messages: deque[str]) -
 
     with console.status(_COMPILING):
         session.warm_up()
-    with Live(console=console, auto_refresh=False) as view:
+    with Live(console=console, screen=True, auto_refresh=False) as view:
 
         def show() -> None:
-            shown = render(session.recorder, session.daemon, session.live, session.seconds, messages, console.width)
+            width, height = console.size
+            shown = render(session.recorder, session.daemon, session.live, list(messages), width, height)
             view.update(shown, refresh=True)
 
         session.run(show, _VIEW_S)

@@ -22,7 +22,7 @@ class Hook:
         path: ``stiffness``, ``torque`` or ``thermal``.
         channel: residual in which a change of the quantity shows.
         like: base parameter (key of the calibration) that changes the same quantity, or None: its regressor times a signal is
-            what any function of that signal would do here. ``like_per_unit`` of it make one unit of the quantity.
+            what any function of that signal would do here.
     """
 
     unit: str

@@ -91,7 +91,7 @@ STATE = np.dtype(
 
 @njit
 def _follow(signal, s, m):
-    """Signals at this sample, before the force is known: the last one, moved along the curve."""
+    """Signals at this sample. Its force is not known yet: the last one is moved along the curve's slope."""
     signal[_ANGLE], signal[_TRAVEL], signal[_SPEED] = m.angle + s.ahead, max(s.past_contact + s.travel, 0.0), m.speed
     force = max(s.force + s.slope * s.travel, 0.0)
     signal[_FORCE], signal[_RATE] = force, s.slope * m.speed
@@ -169,7 +169,8 @@ def _gate(q, signal, maximum_force):
 
 @njit
 def _of_other(q, signal):
-    """Size of the signal that multiplies, a temperature's from where it is nothing, over the largest that was found."""
+    """The signal that multiplies, over the largest at which the term was found: its size, or a temperature's rise above
+    ``other_from``."""
     y = signal[q.other]
     return (y - q.other_from if q.other_from > 0.0 else abs(y)) / (q.other_high - q.other_from)
 
@@ -194,19 +195,19 @@ def _value(q, t, k, dt, maximum_force):
 
 
 @njit
-def _unsure_by(q, signal, added, unsure):
-    """Standard deviation in the port's unit: that of the coefficient, and the term's own size times the distance of its
-    signals from their range, in widths of the range; all that the term can be if a signal is not known. ``unsure``: how far
-    the disc's speed may be off, share."""
+def _sigma_outside(q, signal, added, speed_error):
+    """Standard deviation in the port's unit where a term leaves its range: that of the coefficient, and the term's own size
+    times the distance of its signals from their range, in widths of the range; all that the term can be if a signal is not
+    known. ``speed_error``: standard deviation of the disc's speed, as a share of it."""
     x = signal[q.signal]
-    told = not (q.gate == _TURNING or q.gate == _STANDING) or np.isfinite(signal[_WHEEL])
-    if not (told and np.isfinite(x) and (q.other < 0 or np.isfinite(signal[q.other]))):
+    gate_known = not (q.gate == _TURNING or q.gate == _STANDING) or np.isfinite(signal[_WHEEL])
+    if not (gate_known and np.isfinite(x) and (q.other < 0 or np.isfinite(signal[q.other]))):
         return q.most
     outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
     if q.other >= 0:
         outside += max(_of_other(q, signal) - 1.0, 0.0)
-    if unsure > 0.0 and (q.signal == _WHEEL or q.other == _WHEEL):
-        outside += unsure * (q.exponent if q.signal == _WHEEL and q.shape in (_ODD, _EVEN) else 1.0)
+    if speed_error > 0.0 and (q.signal == _WHEEL or q.other == _WHEEL):
+        outside += speed_error * (q.exponent if q.signal == _WHEEL and q.shape in (_ODD, _EVEN) else 1.0)
     if not outside > 0.0:
         return 0.0
     return hypot(q.sigma, outside * max(abs(added), q.sigma))
@@ -242,12 +243,12 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
     for port in range(len(t.added)):
         t.added[port] = t.outside[port] = 0.0
     of_force = of_torque = 0.0
-    unsure = s.wheel.instead_unsure if s.wheel.contradicted or not m.has_wheel_speed else 0.0
+    speed_error = s.wheel.instead_unsure if s.wheel.contradicted or not m.has_wheel_speed else 0.0
     for k in range(e.count):
         q = e.term[k]
         value = _value(q, t, k, m.dt, p.maximum_force)
         t.added[q.port] += value
-        sigma = _unsure_by(q, t.signal, value, unsure)
+        sigma = _sigma_outside(q, t.signal, value, speed_error)
         if sigma > 0.0:
             t.outside[q.port] = hypot(t.outside[q.port], sigma)
             if q.port <= _STATIC_FORCE:
@@ -262,7 +263,7 @@ def unsure_heat(
     t: Record, p: Record, pads: float, disc: float, plates: float, around: float, power: float, wheel_speed: float,
     braking: bool,
 ) -> tuple[float, float]:  # fmt: skip
-    """Heat (W) into both pads and into the disc that is as unsure as terms outside of their range make it.
+    """Standard deviations of the heat (W) into both pads and into the disc, from terms outside of their range.
 
     ``pads``, ``disc``, ``plates`` and ``around``: temperatures (degC) of friction surfaces, disc, backing plates and ambient.
     """

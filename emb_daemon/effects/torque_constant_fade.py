@@ -13,16 +13,16 @@ from emb_daemon.jit import Record, njit
 RATED_C = 25.0
 
 
-#: Last temperature of the caliper, degC, which stays about that for minutes after its sensor is lost; whether there was one.
-_STATE = np.dtype([("heard", "?"), ("caliper", "f8")], align=True)
+#: Last temperature of the caliper, degC, if one is ``known``: it stays about that for minutes after its sensor is lost.
+_STATE = np.dtype([("known", "?"), ("caliper", "f8")], align=True)
 
 
 @njit
 def term(p: Record, s: Record, m: Record, disc: float, disc_known: bool) -> float:
     """Relative change of the torque constant."""
     if m.has_thermocouple:
-        s.heard, s.caliper = True, m.caliper
-    if p.fade_per_K == 0.0 or not s.heard:
+        s.known, s.caliper = True, m.caliper
+    if p.fade_per_K == 0.0 or not s.known:
         return 0.0
     temperature = s.caliper + (p.disc_share * (disc - s.caliper) if disc_known else 0.0)
     return -p.fade_per_K * (temperature - RATED_C)

@@ -53,21 +53,23 @@ _SETTLED = 16.0
 #: 12 bit meanwhile, rad.
 _KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 
-#: Torque ``shown`` by the current and ``needed`` by the motion, N m, the newest first; sums of squares, (N m)^2: by shift, of
-#: what they change by beside each other, of what the shown one ``changed`` by and the needed one (``moved``), of noise
-#: (``noisy``), and of the shown one's second differences (``curved``), and their product with the difference of both changes
-#: (``against``). ``heard`` cycles without a gap, ``told`` of them that tell, ``restless``: those left until the last is
-#: settled. ``late`` cycles: by which the current is behind, beyond the ``delay`` cycles that are taken out; negative where the
-#: motion is. ``slow`` cycles: time constant of a filter of the current, beyond the ``lag`` that is taken out; negative of the
-#: motion. ``filtered`` A: the last current, as it came or, if the motion is filtered, through that filter. ``rubbed`` N m:
-#: friction in the needed torque. ``slower`` N m: the shown one less friction through each filter, by which it changed in this
-#: cycle (``slower_change``), and ``slower_square``, as above. The last samples: ``age`` s, ``angle``, ``speed``, ``current``.
+#: Torques by the last cycles, N m, the newest first: ``by_current``, ``by_motion``, which inertia and friction need, and the
+#: ``friction`` of that. Leaky sums of squares, (N m)^2: of changes in a cycle by current and by motion (``current_square``,
+#: ``motion_square``), of their difference at each shift (``shift_square``) and with each filter (``low_pass_square``), of
+#: noise (``noise_square``), of second differences by the current (``curvature_square``), and of their product with the
+#: difference of both changes (``curvature_product``). ``consecutive`` cycles without a gap; ``informative`` ones, in which the
+#: torque by motion changed enough, leaky; ``unsettled``: cycles until the last of those counts no more. Found, not yet undone:
+#: ``delay_left`` cycles by which the current is behind, negative if the motion is, and ``lag_left`` cycles of a filter of the
+#: current, negative of the motion. Undone: ``delay`` and ``lag``, likewise. ``filtered`` A: the last current, as it came or,
+#: if the motion is filtered, through that filter. ``low_pass`` N m: torque by the current less friction through each filter,
+#: and its change in this cycle (``low_pass_change``). The last samples: ``age`` s, ``angle``, ``speed``, ``current``.
 ALIGNMENT = np.dtype(
     [
-        *((name, "f8", (_SHIFTS + 1,)) for name in ("shown", "needed", "rubbed")),
-        ("square", "f8", (_SHIFTS,)),
-        *fields("f8", "changed moved noisy curved against heard told restless late delay slow lag filtered"),
-        *((name, "f8", (len(_FILTERS),)) for name in ("slower", "slower_change", "slower_square")),
+        *((name, "f8", (_SHIFTS + 1,)) for name in ("by_current", "by_motion", "friction")),
+        ("shift_square", "f8", (_SHIFTS,)),
+        *fields("f8", "current_square motion_square noise_square curvature_square curvature_product"),
+        *fields("f8", "consecutive informative unsettled delay_left delay lag_left lag filtered"),
+        *((name, "f8", (len(_FILTERS),)) for name in ("low_pass", "low_pass_change", "low_pass_square")),
         *((name, "f8", (_KEPT_SAMPLES,)) for name in ("age", "angle", "speed", "current")),
     ],
     align=True,
@@ -79,10 +81,10 @@ def align(a: Record, m: Record) -> None:
     """Replace motion or current of SAMPLE ``m``, whichever is early, by what belongs to the other, and a filtered current by
     what went into its filter."""
     _keep(a, m)
-    a.restless = max(a.restless - 1.0, 0.0)
+    a.unsettled = max(a.unsettled - 1.0, 0.0)
     if out_of_step(a) and _range(a.angle) < _STANDS_RAD:
-        a.delay = min(max(a.delay + a.late, -EARLIEST), LATEST)
-        a.lag = min(max(a.lag + a.slow, -SLOWEST), SLOWEST)
+        a.delay = min(max(a.delay + a.delay_left, -EARLIEST), LATEST)
+        a.lag = min(max(a.lag + a.lag_left, -SLOWEST), SLOWEST)
         _forget(a)
     if a.delay > 0.0:
         m.angle, m.speed = _at(a.age, a.angle, a.delay * CYCLE_S), _at(a.age, a.speed, a.delay * CYCLE_S)
@@ -104,8 +106,8 @@ def _filter(a, m):
 
 @njit
 def out_of_step(a: Record) -> bool:
-    """Whether current and motion were seen to be apart, which is not yet undone."""
-    return a.late != 0.0 or a.slow != 0.0
+    """Whether current and motion were found to be apart, which is not yet undone."""
+    return a.delay_left != 0.0 or a.lag_left != 0.0
 
 
 @njit
@@ -138,44 +140,47 @@ def _at(ages, values, age):
 
 
 @njit
-def compare(a: Record, shown: float, needed: float, rubbed: float, noise: float) -> None:
-    """Take one cycle's torque by the current and by the motion while the pads are apart, N m, and what ``rubbed`` of it;
-    ``noise`` N m: standard deviation by which they may differ from noise of the speed and the part of a cycle that is allowed
-    for."""
+def compare(a: Record, by_current: float, by_motion: float, friction: float, noise: float) -> None:
+    """Take one cycle's torque by the current and by the motion, and the friction of the latter, N m, while the pads are apart.
+
+    ``noise`` N m: standard deviation of their difference, by the noise of the speed and by the part of a cycle of delay that
+    the estimate allows for."""
     for i in range(_SHIFTS, 0, -1):
-        a.shown[i], a.needed[i], a.rubbed[i] = a.shown[i - 1], a.needed[i - 1], a.rubbed[i - 1]
-    a.shown[0], a.needed[0], a.rubbed[0] = shown, needed, rubbed
-    a.heard += 1.0
-    _slow_down(a)
-    if a.heard <= _SHIFTS or _range(a.needed) < _CLEAR * noise or _range(a.angle) < _MOVED_RAD:
+        a.by_current[i], a.by_motion[i], a.friction[i] = a.by_current[i - 1], a.by_motion[i - 1], a.friction[i - 1]
+    a.by_current[0], a.by_motion[0], a.friction[0] = by_current, by_motion, friction
+    a.consecutive += 1.0
+    _low_pass(a)
+    if a.consecutive <= _SHIFTS or _range(a.by_motion) < _CLEAR * noise or _range(a.angle) < _MOVED_RAD:
         return
-    a.restless = _SETTLED
-    a.told += 1.0 - a.told / _KEPT
-    # By what they change in a cycle: friction that the calibration does not know changes slowly.
-    changed, before = a.shown[EARLIEST] - a.shown[EARLIEST + 1], a.shown[EARLIEST + 1] - a.shown[EARLIEST + 2]
-    moved = a.needed[EARLIEST] - a.needed[EARLIEST + 1]
-    curved = changed - before
-    a.changed, a.moved = _add(a.changed, changed * changed), _add(a.moved, moved * moved)
-    a.noisy = _add(a.noisy, noise * noise)
-    a.curved, a.against = _add(a.curved, curved * curved), _add(a.against, (moved - changed) * curved)
+    a.unsettled = _SETTLED
+    a.informative += 1.0 - a.informative / _KEPT
+    # Changes in a cycle are compared: friction that the calibration does not know changes slowly.
+    changed = a.by_current[EARLIEST] - a.by_current[EARLIEST + 1]
+    moved = a.by_motion[EARLIEST] - a.by_motion[EARLIEST + 1]
+    curved = changed - (a.by_current[EARLIEST + 1] - a.by_current[EARLIEST + 2])
+    a.current_square = _add(a.current_square, changed * changed)
+    a.motion_square = _add(a.motion_square, moved * moved)
+    a.noise_square = _add(a.noise_square, noise * noise)
+    a.curvature_square = _add(a.curvature_square, curved * curved)
+    a.curvature_product = _add(a.curvature_product, (moved - changed) * curved)
     for i in range(_SHIFTS):
-        off = changed - (a.needed[i] - a.needed[i + 1])
-        a.square[i] = _add(a.square[i], off * off)
+        off = changed - (a.by_motion[i] - a.by_motion[i + 1])
+        a.shift_square[i] = _add(a.shift_square[i], off * off)
     for i in range(len(_FILTERS)):
-        off = a.slower_change[i] - (moved - (a.rubbed[EARLIEST] - a.rubbed[EARLIEST + 1]))
-        a.slower_square[i] = _add(a.slower_square[i], off * off)
-    a.late, a.slow = _found(a)
+        off = a.low_pass_change[i] - (moved - (a.friction[EARLIEST] - a.friction[EARLIEST + 1]))
+        a.low_pass_square[i] = _add(a.low_pass_square[i], off * off)
+    a.delay_left, a.lag_left = _found(a)
 
 
 @njit
-def _slow_down(a):
-    """What accelerates the motor, through each filter. Friction does not go through that of the motion."""
-    accelerates = a.shown[EARLIEST] - a.rubbed[EARLIEST]
+def _low_pass(a):
+    """The torque that accelerates the motor, through each filter. Friction does not go through a filter of the motion."""
+    accelerates = a.by_current[EARLIEST] - a.friction[EARLIEST]
     for i in range(len(_FILTERS)):
-        if a.heard <= EARLIEST + 1:
-            a.slower[i] = accelerates
-        a.slower_change[i] = (accelerates - a.slower[i]) / (1.0 + _FILTERS[i])
-        a.slower[i] += a.slower_change[i]
+        if a.consecutive <= EARLIEST + 1:
+            a.low_pass[i] = accelerates
+        a.low_pass_change[i] = (accelerates - a.low_pass[i]) / (1.0 + _FILTERS[i])
+        a.low_pass[i] += a.low_pass_change[i]
 
 
 @njit
@@ -185,26 +190,26 @@ def _add(total, term):
 
 @njit
 def _found(a):
-    """Shift and time constant, cycles, of which one at most is not 0: what explains most, if it explains enough."""
-    apart = a.square[EARLIEST]
-    if a.told < _ENOUGH or apart < _BEYOND_SLOW * _BEYOND_SLOW * a.noisy:
+    """Delay and time constant, cycles, at most one of them not 0: the one that explains most, if that is enough."""
+    apart = a.shift_square[EARLIEST]
+    if a.informative < _ENOUGH or apart < _BEYOND_SLOW * _BEYOND_SLOW * a.noise_square:
         return 0.0, 0.0
-    # A current, or a motion, that shows nothing is explained by nothing.
-    place, least = _least(a.square)
-    left, shift, slow = least / min(apart, a.changed), place - EARLIEST, 0.0
-    if a.against > 0.0:
-        undone = 1.0 - a.against * a.against / (a.curved * apart)
+    # A shift or filter must explain more than no torque at all would: a dead current is neither late nor filtered.
+    place, least = _least(a.shift_square)
+    left, shift, slow = least / min(apart, a.current_square), place - EARLIEST, 0.0
+    if a.curvature_product > 0.0:
+        undone = 1.0 - a.curvature_product * a.curvature_product / (a.curvature_square * apart)
         if undone < left:
-            left, slow = undone, a.against / a.curved
-    place, least = _least(a.slower_square)
-    filtered = least / min(apart, a.moved)
+            left, slow = undone, a.curvature_product / a.curvature_square
+    place, least = _least(a.low_pass_square)
+    filtered = least / min(apart, a.motion_square)
     if filtered < left and filtered < 1.0 - _EXPLAINS_MOTION:
         left, slow = filtered, -_FILTERS[0] * exp(log(2.0) * place)
     if left > 1.0 - _EXPLAINS:
         return 0.0, 0.0
     if slow != 0.0:
         return 0.0, slow if abs(slow) > _WORTH_SLOW else 0.0
-    return shift if abs(shift) > _WORTH and apart > _BEYOND * _BEYOND * a.noisy else 0.0, 0.0
+    return shift if abs(shift) > _WORTH and apart > _BEYOND * _BEYOND * a.noise_square else 0.0, 0.0
 
 
 @njit
@@ -227,17 +232,18 @@ def _least(squares):
 @njit
 def interrupt(a: Record) -> None:
     """Begin anew after a sample that is missing or not to be compared."""
-    a.heard = 0.0
+    a.consecutive = 0.0
 
 
 @njit
 def _forget(a):
-    """Compare anew: what was seen so far was of other signals."""
-    a.late = a.slow = a.told = a.heard = a.changed = a.moved = a.noisy = a.curved = a.against = 0.0
+    """Compare anew: the sums are of signals that are now changed."""
+    a.delay_left = a.lag_left = a.informative = a.consecutive = 0.0
+    a.current_square = a.motion_square = a.noise_square = a.curvature_square = a.curvature_product = 0.0
     for i in range(_SHIFTS):
-        a.square[i] = 0.0
+        a.shift_square[i] = 0.0
     for i in range(len(_FILTERS)):
-        a.slower_square[i] = 0.0
+        a.low_pass_square[i] = 0.0
 
 
 @njit
@@ -248,6 +254,6 @@ def at_bound(a: Record) -> bool:
 
 @njit
 def aligned(a: Record) -> bool:
-    """Whether a torque of now may be used before the contact angle is known: nothing has changed of late, or the changes were
-    seen to belong together."""
-    return not out_of_step(a) and (a.told >= _ENOUGH or a.restless == 0.0)
+    """Whether the present torque may be used before the contact angle is known: torques have not changed of late, or their
+    changes were found to belong together."""
+    return not out_of_step(a) and (a.informative >= _ENOUGH or a.unsettled == 0.0)

@@ -37,9 +37,9 @@ _BEYOND_RAD = 0.1
 #: Least and largest time constant of the speed's filter, s: a speed that is the mean of its cycle is half a cycle old, as it
 #: was at calibration; through more than twelve cycles a stroke is not seen.
 _WORTH_S, SLOWEST_S = 0.5 * CYCLE_S, 12.0 * CYCLE_S
-#: Standard deviation of an age from which a filter is sought, s, and as a share of the age: as a stroke begins, a speed that
-#: is late does not follow at all, as through any filter. Chosen on our own plant: without it a speed two cycles late passed
-#: for a filter of twelve, and without the share one of 25 ms was found a stroke too late.
+#: Standard deviation of an age up to which a filter is sought, s, and as a share of the age: at the beginning of a stroke a
+#: late speed looks like one through any filter. Chosen on our own plant: without it a speed two cycles late passed for a
+#: filter of twelve, and without the share a filter of 25 ms was found a stroke too late.
 _CLEAR_S, _CLEAR = 2.5e-4, 0.04
 #: Samples of a motor that stands over which its speed is averaged, standard deviations of that mean from which it is an
 #: offset, and largest offset, rad/s: a motor that went faster for as long would have gone a turn. Samples over which an offset
@@ -112,7 +112,7 @@ def stand(a: Record, speed: float, noise: float) -> bool:
 
     Returns whether the speed's offset is found to be another, which is taken off from the next sample on."""
     if abs(a.stood * speed - a.standing) > _CERTAIN * noise * sqrt(a.stood * (a.stood + 1.0)):
-        # It has begun to turn, beside an angle that is late, or the offset is another.
+        # The motor has begun to turn while its angle is late, or the offset has changed.
         a.standing = a.stood = 0.0
         return False
     a.standing += speed
@@ -135,7 +135,7 @@ def follow(a: Record, travel: float, turned: float, gained: float, noise: float,
     """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s; ``noise``
     rad/s of the speed."""
     if a.interrupted:
-        # An angle that has caught up has gone further than its speed says.
+        # After a gap the angle has gone further than the last speeds say.
         a.interrupted = False
         return
     keep = exp(-dt / _FOLLOWED_S)
@@ -153,7 +153,7 @@ def follow(a: Record, travel: float, turned: float, gained: float, noise: float,
     if abs(a.gained) < STANDING_RAD_PER_S:
         return
     _add(a.recent, min(old, variance / (_PRECISE_S * _PRECISE_S) / max(a.recent[_SS], 1.0)), a.apart, a.gained, a.gone)
-    # Of a filter nothing is known before.
+    # Nothing is known of a filter beforehand, so its prior is as wide as the slowest.
     age, age_sigma, _, _ = _solve(a.recent, variance, SLOWEST_S)
     a.ahead = -age if abs(age) > _WORTH_S and age_sigma < max(_CLEAR_S, _CLEAR * abs(age)) else 0.0
 
@@ -184,7 +184,7 @@ def find_filter(a: Record) -> bool:
     filtered = min(max(a.filtered + a.ahead, 0.0), SLOWEST_S)
     if filtered == a.filtered:
         return False
-    # All that was followed so far was beside another speed.
+    # The sums belong to the speed before this change.
     a.filtered = filtered
     a.age = a.gain = a.ahead = a.apart = a.gained = a.gone = 0.0
     for i in range(len(a.sums)):

@@ -73,9 +73,9 @@ _STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
 #: Samples of a motor that turns in which the current repeats to the bit: its sensor goes no further. By chance, at one
 #: repetition in five, once in 3000.
 _PINNED = 5
-#: Angle that the torque must have turned the motor by, rad, to contradict an angle that stands: eight times what is computed
-#: from rest for a motor that in truth came from one side and went back there. Torque beyond friction, in standard deviations,
-#: that noise may cause: one sample of 700 has more, and three in a row are needed.
+#: Angle by which the torque must have turned the motor, rad, to contradict an angle that stands: eight times what a motor
+#: would get that turns back between two samples, if it were taken to start from rest. Torque beyond friction that noise may
+#: cause, in standard deviations: one sample of 700 has more, and three in a row are needed.
 _DUE_RAD, BEYOND_CHANCE = 10.0 * _STANDS_RAD, 3.0
 #: Distance from the contact angle, in its standard deviations, from which the pads certainly do not touch.
 _CLEAR_OF_CONTACT = 6.0
@@ -147,8 +147,8 @@ def watch(
 
 @njit
 def _look_for_limit(c, current, travel):
-    """Notice whether the ``current`` (A) is as far as its sensor goes: then that much flows, or more. A value that was none
-    such is disbelieved until the current has exceeded it."""
+    """Learn the limit of the current sensor: a ``current`` (A) that repeats while the motor turns. At the limit as much flows,
+    or more. A limit that the current exceeds was none."""
     c.pinned = c.pinned + 1 if c.idle > 0 and abs(travel) > _STANDS_RAD else 0
     if c.pinned >= _PINNED and c.current_flickered >= _FLICKERED:
         c.limit = abs(current)
@@ -230,14 +230,14 @@ def believe_resolver(c: Record) -> None:
 
 @njit
 def disbelieve_resolver(c: Record) -> None:
-    """Use the resolver no more until its angle moves as the speed says."""
+    """Do not use the resolver until its angle again moves as the speed says."""
     if c.verdict != STIFFNESS_WRONG:
         c.verdict, c.alike, c.frozen_s = STIFFNESS_WRONG, 0, _AVERAGED_S
 
 
 @njit
 def count_contradiction(c: Record, ratio: float) -> None:
-    """Add one contradiction, in standard deviations, to the sum; NaN says nothing."""
+    """Add one normalised innovation to the sum of contradictions; NaN, none was made, adds nothing."""
     if np.isfinite(ratio):
         total = max(c.contradiction + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0)
         c.contradiction = min(total, 1.5 * _UNCONFIRMED * _RAISE)

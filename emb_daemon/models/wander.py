@@ -54,8 +54,8 @@ _COUNTS_RAD, _MISSED = 0.003, 0.001
 #: speed that is cut off instead of rounded is off by, and a tenth of its noise. It shows as a drift that was always there, and
 #: is learned from what differs from it by less than so many standard deviations. Time in which it becomes another, s.
 OFFSET_RAD_PER_S, _OFFSET_OF_NOISE, _LIKE_BEFORE, _OFFSET_CHANGES_S = 0.02, 0.1, 2.0, 600.0
-#: Standard deviations from which a drift or a loss counts in the force's sigma, and from which it is told: of evidence that
-#: renews itself in 40 s, one in a few hours of driving has so much by chance, and one in a week.
+#: Standard deviations from which a drift or a loss counts in the force's sigma, and from which it is reported: the
+#: evidence renews itself in 40 s, so that chance reaches the first once in a few hours of driving, the second once in a week.
 _LIKELY, _SURELY = 3.0, 4.0
 
 
@@ -118,10 +118,10 @@ def _take_stretch(a, noise):
     if a.found and not was:
         a.unseen, a.strayed = a.strayed, 0.0
     if abs(apart) < _LIKE_BEFORE * apart_sigma:
-        # Evidence that renews itself in `_KEPT_S` counts once in that time.
-        told = a.seconds / (_KEPT_S * rate_sigma * rate_sigma)
-        a.offset_weight += told
-        a.offset_sum += told * rate
+        # The estimate of the rate renews itself in `_KEPT_S`, so it counts once in that time.
+        weight = a.seconds / (_KEPT_S * rate_sigma * rate_sigma)
+        a.offset_weight += weight
+        a.offset_sum += weight * rate
 
 
 @njit

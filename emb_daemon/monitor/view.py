@@ -1,6 +1,7 @@
 """The view on a terminal: five lines for each corner, four corners in 80 x 24."""
 
 import math
+import textwrap
 
 from rich.console import Group
 from rich.text import Text
@@ -14,7 +15,7 @@ _SILENT_S = 0.5
 _LINES_PER_CORNER = 5
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _MODE_COLOURS = dict(zip(MODES, ("dim", "green", "cyan", "yellow", "bold red"), strict=True))
-STATUS_COLOURS = {"ok": "green", "degraded": "yellow", "fault": "bold red", "not available": "dim"}
+_STATUS_COLOURS = {"ok": "green", "degraded": "yellow", "fault": "bold red", "not available": "dim"}
 _MISSING = "–"
 
 
@@ -35,25 +36,6 @@ def number(value: float | None, digits: int) -> str:
     return _MISSING if value is None else f"{value:.{digits}f}"
 
 
-def _two_lines(texts: list[str], width: int) -> list[str]:
-    """Texts with commas between them on at most two lines; those without room are counted."""
-    lines, left = [""], list(texts)
-    while left:
-        more = f" … and {len(left)} more"
-        candidate = f"{lines[-1]}, {left[0]}" if lines[-1] else left[0]
-        reserve = len(more) if len(lines) == 2 and len(left) > 1 else 1
-        if len(candidate) + reserve <= width:
-            lines[-1] = candidate
-            left.pop(0)
-        elif len(lines) == 1:
-            lines[-1] += ","
-            lines.append("")
-        else:
-            lines[-1] += more
-            break
-    return [*lines, ""][:2]
-
-
 def _adaptation(request: str | None, progress_percent: int | None, result: str | None) -> Text:
     if request == "run":
         done = round(progress_percent / 20)
@@ -63,7 +45,8 @@ def _adaptation(request: str | None, progress_percent: int | None, result: str |
     return Text(f"adaptation {result}", style="green" if result == "accepted" else "yellow")
 
 
-def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
+def corner_lines(corner: Corner, now_ns: int, width: int) -> list[Text]:
+    """A corner's five lines."""
     state = corner.state(now_ns)
     silent = corner.silent_s(now_ns)
 
@@ -91,11 +74,11 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     if silent > _SILENT_S:
         third.append(f"SILENT for {silent:.0f} s; last values shown", style="bold red")
     else:
-        third.append(state["status"], style=STATUS_COLOURS.get(state["status"], "red"))
+        third.append(state["status"], style=_STATUS_COLOURS.get(state["status"], "red"))
         if state["input_age_ms"]:
             third.append(f"  {state['input_age_ms']} ms old", style="yellow")
     if state["clamp_force_ref_kN"] is not None:
-        third.append(f"  sensor {number(state['clamp_force_ref_kN'], 2)} kN")
+        third.append(f"  reference {number(state['clamp_force_ref_kN'], 2)} kN")
     third.append(f"  {state['forces_per_s']:.0f}/s  ")
     third.append(f"{corner.missing} missing", style="yellow" if corner.missing else "dim")
     third.append("  ")
@@ -103,8 +86,8 @@ def _corner(corner: Corner, now_ns: int, width: int) -> list[Text]:
     third.append("  ")
     third.append_text(_adaptation(**state["adaptation"]))
 
-    reasons = [Text(f"   {line}", style="yellow") for line in _two_lines(state["reasons"], width - 4)]
-    return [first, second, third, *reasons]
+    reasons = textwrap.wrap(", ".join(state["reasons"]), width - 4, max_lines=2, placeholder=" …")
+    return [first, second, third, *(Text(f"   {line}", style="yellow") for line in [*reasons, "", ""][:2])]
 
 
 def render(listener: Listener, now_ns: int, title: str, width: int, height: int, paused: bool = False) -> Group:
@@ -119,7 +102,7 @@ def render(listener: Listener, now_ns: int, title: str, width: int, height: int,
         ]
     room = max(1, (height - 2) // _LINES_PER_CORNER)
     for corner in corners[:room]:
-        lines += _corner(corner, now_ns, width)
+        lines += corner_lines(corner, now_ns, width)
     if len(corners) > room:
         lines[0].append(f"  (a taller window shows {', '.join(corner.name for corner in corners[room:])})", style="yellow")
     lines = lines[: height - 1] + [Text("")] * (height - 1 - len(lines))
@@ -144,7 +127,7 @@ def summary(listener: Listener, now_ns: int) -> list[str]:
         counts = f"{state['forces_per_s']:.0f}/s, {state['missing']} missing, {state['damaged']} damaged"
         reasons = f"; {', '.join(state['reasons'])}" if state["reasons"] else ""
         reference = state["clamp_force_ref_kN"]
-        sensor = "" if reference is None else f" (sensor {number(reference, 3)} kN)"
+        sensor = "" if reference is None else f" (reference {number(reference, 3)} kN)"
         lines.append(
             f"{corner.name} {force} ± {sigma} kN{sensor} {state['source']}, {state['mode']}, {pads}, {counts}{reasons}"
         )

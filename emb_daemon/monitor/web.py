@@ -155,9 +155,7 @@ class Receiver(Protocol):
     def show(self, listener: Listener, now_ns: int) -> None: ...
 
 
-def hand_out(
-    bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool], shared: PresentEstimates | None = None
-) -> None:
+def hand_out(bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool], shared: PresentEstimates | None) -> None:
     """Receive a bus, and what the daemon ``shared`` of it, for ``receivers``, until ``stopped()``."""
     listener = Listener()
     bus.drain()

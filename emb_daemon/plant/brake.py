@@ -120,7 +120,7 @@ def _apply_shape(e, x):
 
 @njit
 def drawn_amount(e: Record, s: Record, place: int, dt: float) -> float:
-    """Amount that one drawn effect adds, asked for every ``dt`` s."""
+    """Amount that one drawn effect adds; called every ``dt`` s. ``place``: where its lag is kept in the state."""
     if e.size == 0.0:
         return 0.0
     value = e.size * _apply_shape(e, _signal(s, int(e.signal)))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.jit import njit
 from emb_daemon.logs.columns import DEPTHS_MM
 from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, growth, motor_angle, move_motor, static_angle
@@ -15,7 +16,6 @@ from emb_daemon.plant.records import (
     CAR,
     CYCLE_NS,
     HISTORY,
-    PAD_DEPTHS_M,
     PLANT,
     PLANT_STATE,
     SUBSTEP_S,
@@ -40,6 +40,8 @@ _BEFORE_CONTACT_RAD = 2.0
 _SLOW_NS, _STATUS_NS, _REFERENCE_SLOW_NS = 10_000_000, 100_000_000, 100_000_000
 #: Delay of the slow messages after their sample, and of the rig's instruments after the resolver's frame.
 _AFTER_NS, _REFERENCE_AFTER_NS = 900_000, 400_000
+#: Frames leave up to this late after their sample, s.
+_JITTER_S = 150e-6
 #: Frames that one cycle can hold with four corners and reference instruments.
 FRAMES_PER_TICK = 32
 
@@ -154,9 +156,9 @@ def _send(w, slot, payload, frames, count, time_ns):
 
 
 @njit
-def _say(w, rng, slot, payload, frames, count, due_ns, least_late):
-    """The same; it leaves after ``due_ns`` by ``least_late`` to ``least_late`` + 1 times the jitter."""
-    return _send(w, slot, payload, frames, count, due_ns + np.int64(1e9 * w.car[0].jitter * (least_late + rng.random())))
+def _send_late(w, rng, slot, payload, frames, count, due_ns, least_late):
+    """A protected message of the car that leaves by ``least_late`` to ``least_late`` + 1 times the jitter after ``due_ns``."""
+    return _send(w, slot, payload, frames, count, due_ns + np.int64(1e9 * _JITTER_S * (least_late + rng.random())))
 
 
 @njit
@@ -170,13 +172,13 @@ def _fast_frames(w, rng, row, frames, count):
         s.angle_reading = p.angle_count * np.floor(noisy / p.angle_count + 0.5)
     speed = s.speed + p.speed_noise * rng.standard_normal()
     payload = pack(s.angle_reading, received[base, 0]) | pack(speed, received[base, 1])
-    count = _say(w, rng, base + wire.RESOLVER, payload, frames, count, car.time_ns, 0.0)
+    count = _send_late(w, rng, base + wire.RESOLVER, payload, frames, count, car.time_ns, 0.0)
     slot = base + wire.CURRENT
     mean = s.mean_current if p.effects.current_delay.delay_s == 0.0 else delayed_mean_current(p, s)
     current = mean + s.mean_current_error - p.effects.current_offset.offset_A
     payload = pack(current, received[slot, 0]) | pack(0.15 * rng.standard_normal(), received[slot, 1])
     payload |= pack(car.supply_voltage, received[slot, 2])
-    return _say(w, rng, slot, payload, frames, count, car.time_ns, 0.5)
+    return _send_late(w, rng, slot, payload, frames, count, car.time_ns, 0.5)
 
 
 @njit
@@ -202,7 +204,7 @@ def _slow_frames(w, rng, drive, frames, count, due_ns):
         payload = pack(s.plate_reading[0] + p.temperature_noise * rng.standard_normal(), received[slot, 0])
         payload |= pack(s.plate_reading[1] + p.temperature_noise * rng.standard_normal(), received[slot, 1])
         payload |= pack(s.caliper + p.temperature_noise * rng.standard_normal(), received[slot, 2])
-        count = _say(w, rng, slot, payload, frames, count, leaves_ns, 0.0)
+        count = _send_late(w, rng, slot, payload, frames, count, leaves_ns, 0.0)
     speeds, pulses = np.uint64(0), np.uint64(0)
     elapsed = 1e-9 * (due_ns - car.time_ns)
     for corner in range(4):
@@ -214,13 +216,13 @@ def _slow_frames(w, rng, drive, frames, count, due_ns):
         angle += elapsed * car.wheel_speed
         pulse = np.int64(np.floor(angle / (2.0 * pi) * PULSES_PER_TURN)) % PULSE_MODULO
         pulses |= pack(float(pulse), received[wire.WHEEL_PULSE, corner])
-    count = _say(w, rng, wire.WHEEL_SPEED, speeds, frames, count, leaves_ns, 0.0)
-    count = _say(w, rng, wire.WHEEL_PULSE, pulses, frames, count, leaves_ns, 0.0)
+    count = _send_late(w, rng, wire.WHEEL_SPEED, speeds, frames, count, leaves_ns, 0.0)
+    count = _send_late(w, rng, wire.WHEEL_PULSE, pulses, frames, count, leaves_ns, 0.0)
     if due_ns % _STATUS_NS == 0:
         signals = received[wire.VEHICLE_STATUS]
         payload = pack(float(drive.park_brake), signals[0]) | pack(float(drive.brake_request), signals[1])
         payload |= pack(drive.ambient, signals[2]) | pack(car.speed, signals[3])
-        count = _say(w, rng, wire.VEHICLE_STATUS, payload, frames, count, leaves_ns, 0.5)
+        count = _send_late(w, rng, wire.VEHICLE_STATUS, payload, frames, count, leaves_ns, 0.5)
     return count
 
 
@@ -233,13 +235,13 @@ def _reference_frames(w, rng, row, frames, count, slow):
     torque = s.brake_torque + p.brake_torque_noise * rng.standard_normal()
     payload = pack(force, signal[0, 0]) | pack(torque, signal[0, 1])
     payload |= pack(s.disc + p.temperature_noise * rng.standard_normal(), signal[0, 2])
-    sent = car.time_ns + _REFERENCE_AFTER_NS + np.int64(1e9 * car.jitter * rng.random())
+    sent = car.time_ns + _REFERENCE_AFTER_NS + np.int64(1e9 * _JITTER_S * rng.random())
     count = _put(frames, count, sent, can_id[0], payload)
     if slow:
         for side in range(2):
             payload = np.uint64(0)
-            for index in range(len(PAD_DEPTHS_M)):
-                reading = pad_at(p, s, side, PAD_DEPTHS_M[index]) + p.temperature_noise * rng.standard_normal()
+            for index in range(len(DEPTHS_M)):
+                reading = pad_at(p, s, side, DEPTHS_M[index]) + p.temperature_noise * rng.standard_normal()
                 payload |= pack(reading, signal[1 + side, index])
             count = _put(frames, count, sent, can_id[1 + side], payload)
     return count
@@ -254,9 +256,9 @@ def _record(car, p, s, corner, counter, drive, training, truth):
     truth.stiffness_factor, truth.brake_torque = s.stiffness_factor, s.brake_torque
     for side in range(2):
         truth.surface[side], truth.mean[side], truth.plate[side] = s.surface[side], pad_mean(p, s, side), s.plate[side]
-        for index in range(len(PAD_DEPTHS_M)):
-            inside = PAD_DEPTHS_M[index] <= p.pad_thickness
-            truth.depth[side, index] = pad_at(p, s, side, PAD_DEPTHS_M[index]) if inside else np.nan
+        for index in range(len(DEPTHS_M)):
+            inside = DEPTHS_M[index] <= p.pad_thickness
+            truth.depth[side, index] = pad_at(p, s, side, DEPTHS_M[index]) if inside else np.nan
     truth.caliper, truth.disc = s.caliper, s.disc
     truth.wheel_speed, truth.wheel_angle, truth.vehicle_speed = car.wheel_speed, s.wheel_angle, car.speed
     truth.wear, truth.training = s.wear, training.running
@@ -364,7 +366,6 @@ class Car:
         reference: send the rig instruments' RIG_* frames too.
         start_ns: time of the first sample, less one cycle.
         ambient: degC; everything starts at this temperature.
-        jitter_s: frames leave up to this late after their sample.
 
     Attributes:
         truth: TRUTH array, one row per corner, of the last tick.
@@ -379,7 +380,6 @@ class Car:
         reference: bool = False,
         start_ns: int = 0,
         ambient: float = 22.0,
-        jitter_s: float = 150e-6,
     ):
         if len(plants) != len(corners):
             raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
@@ -395,7 +395,7 @@ class Car:
         motion["mass"], motion["wheel_radius"] = 400.0 * len(corners), 0.31
         motion["drag"], motion["rolling"] = 0.1 * len(corners), 50.0 * len(corners)
         motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
-        motion["time_ns"], motion["reference"], motion["jitter"] = start_ns, reference, jitter_s
+        motion["time_ns"], motion["reference"] = start_ns, reference
         self.states["wheel_angle"] = rng.uniform(0.0, PULSE_MODULO / PULSES_PER_TURN * 2.0 * pi, len(plants))
         fast = wire.CORNER_MESSAGES * np.arange(4)
         drawn = np.setdiff1d(np.arange(wire.SLOTS), fast + wire.FORCE_SENSOR)

@@ -166,10 +166,9 @@ def _set_sensors(p: np.void, noise: Noise) -> None:
 
 def _set_effects(p: np.void, effects: Mapping[str, Mapping[str, float]]) -> None:
     for name, values in effects.items():
-        known = [field.name for field in EFFECTS[name]]
         for key, value in values.items():
-            if key not in known:
-                raise KeyError(f"effect {name} has no parameter {key}; expected {', '.join(known)}")
+            if key not in EFFECTS[name]:
+                raise KeyError(f"effect {name} has no parameter {key}; expected {', '.join(EFFECTS[name])}")
             p["effects"][name][key] = value
 
 
@@ -180,5 +179,5 @@ def _scatter(p: np.void, rng: np.random.Generator, scattered_effects: set[str]) 
     p["contact_angle"] += _CONTACT_SCATTER_RAD * rng.standard_normal()
     p["released_angle"] = rng.uniform(*_RELEASED_RANGE_RAD)
     for name in sorted(scattered_effects & set(EFFECTS)):
-        for field in EFFECTS[name]:
-            p["effects"][name][field.name] *= 1.0 + _EFFECT_SCATTER * rng.standard_normal()
+        for key in EFFECTS[name]:
+            p["effects"][name][key] *= 1.0 + _EFFECT_SCATTER * rng.standard_normal()

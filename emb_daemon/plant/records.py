@@ -1,9 +1,11 @@
-"""Records of the plant. SI units, temperatures in degC; every field of a table states its unit and meaning."""
+"""Records of the plant. SI units, temperatures in degC; parameters state their unit and meaning."""
 
 from typing import NamedTuple
 
 import numpy as np
 
+from emb_daemon.effects import REGISTRY
+from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.jit import fields
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.layout import SLOTS
@@ -18,7 +20,6 @@ HISTORY = 64
 CURVE_TERMS = 5
 #: Points of the travel of a gear that is not constant, linear between them.
 TRAVEL_POINTS = 257
-PAD_DEPTHS_M = (0.002, 0.004, 0.006, 0.008)
 
 
 class Field(NamedTuple):
@@ -30,113 +31,40 @@ class Field(NamedTuple):
     shape: tuple[int, ...] = ()
 
 
-#: Effects that a plant can have, all off at zero. The first group has the names and parameters of the catalogue. The second
-#: group is not in the catalogue, so that a diagnosis can be tested on unknown effects.
-EFFECTS: dict[str, tuple[Field, ...]] = {
-    "disc_thickness_variation": tuple(
-        Field(f"order_{order}_{part}_um", "um", f"{part} of {order} per turn, over the angle that wheel pulses count")
-        for order in range(1, 5)
-        for part in ("cosine", "sine")
+#: Effects that a plant can have, all off at zero, with the names of their parameters. The catalogue's have its names and
+#: units; their physics is the plant's own. The others are not in the catalogue, so that a diagnosis can be tested on unknown
+#: effects:
+#:
+#:     clamp_creep            share of the force that creeps in, with a time constant of tens of seconds
+#:     brake_torque_coupling  relative gain of clamp force with brake torque, 1/(N m)
+#:     caliper_softening      relative loss of stiffness as the caliper warms over 22 degC, 1/K
+#:     spindle_lead_error     travel error, um, over the spindle's turn, whose order is periods per motor turn
+#:     cold_grease            relative rise of gear friction as the caliper cools below 22 degC, 1/K, and viscous friction at
+#:                            12 degC, N m s/rad, which doubles every further 10 K down
+#:     current_delay          s by which the mean of the measured current ends early, up to 12 ms
+#:     drawn_PLACE            drawn by a seed: size × shape(signal) × other signal, through a lag; signals by their index in
+#:                            `brake.SIGNALS`, ``other`` negative for none, shapes as in `brake`. ``size`` is what is added
+#:                            where the signals are at their usual sizes: um of disc and pads (thickness), W (disc_heat), or
+#:                            the change of a factor
+EFFECTS: dict[str, tuple[str, ...]] = {
+    **{effect.name: tuple(parameter.name for parameter in effect.parameters) for effect in REGISTRY},
+    "clamp_creep": ("share", "time_constant_s"),
+    "brake_torque_coupling": ("per_Nm",),
+    "caliper_softening": ("per_K",),
+    "spindle_lead_error": ("amplitude_um", "order_per_turn", "phase_rad"),
+    "cold_grease": ("per_K", "viscous_Nms_per_rad"),
+    "current_delay": ("delay_s",),
+    **dict.fromkeys(
+        (
+            "drawn_stiffness", "drawn_thickness", "drawn_torque_constant", "drawn_gear_friction", "drawn_gear_gain",
+            "drawn_pad_friction", "drawn_contact_conductance", "drawn_gap_conductance", "drawn_disc_cooling",
+            "drawn_heat_share", "drawn_disc_heat", "drawn_pad_conductivity",
+        ),
+        ("size", "signal", "shape", "exponent", "other", "lag_s"),
     ),
-    "disc_thermal_expansion": (Field("growth_um_per_K", "um/K", "disc and pads grow with the disc's temperature"),),
-    "pad_wear": (Field("wear_um_per_MJ", "um/MJ", "both pads together, by friction energy"),),
-    "torque_constant_fade": (
-        Field("fade_per_K", "1/K", "relative loss of torque constant as the magnets warm over 25 degC"),
-        Field("disc_share", "1", "where the motor's surroundings lie between caliper and disc"),
-    ),
-    "torque_saturation": (Field("loss_per_A2", "1/A2", "relative loss of torque constant per squared current"),),
-    "motor_heat_fade": (
-        Field("fade_per_A2", "1/A2", "relative loss of torque constant per squared current, settled"),
-        Field("time_constant_s", "s", "of the heat on its way from winding to magnets"),
-    ),
-    "current_offset": (Field("offset_A", "A", "flows but is not measured"),),
-    "viscous_friction": (Field("viscous_Nms_per_rad", "N m s/rad", "friction torque per motor speed"),),
-    "stribeck_friction": (
-        Field("rise", "1", "friction at standstill over sliding friction, minus one"),
-        Field("speed_rad_per_s", "rad/s", "motor speed at which the rise has fallen to 1/e"),
-    ),
-    "friction_asymmetry": (Field("asymmetry", "1", "share by which friction is more when clamping, less when releasing"),),
-    "gear_mesh_ripple": (
-        Field("cosine", "1", "of the torque that the clamp force needs"),
-        Field("sine", "1", "likewise"),
-        Field("order_per_turn", "1", "ripples per motor turn"),
-    ),
-    "cogging_torque": (
-        Field("cosine_Nm", "N m", "torque that turning takes whatever the load"),
-        Field("sine_Nm", "N m", "likewise"),
-        Field("order_per_turn", "1", "teeth per motor turn"),
-    ),
-    "stiffness_hysteresis": (
-        Field("share", "1", "half width of the loop over the clamp force"),
-        Field("slip_angle_rad", "rad", "motor angle over which the slip element stretches"),
-    ),
-    "second_hysteresis": (
-        Field("share", "1", "half width of a second element's loop over the clamp force"),
-        Field("slip_angle_rad", "rad", "motor angle over which that stretches"),
-    ),
-    "second_relaxation": (
-        Field("share", "1", "share of the force that settles slowly"),
-        Field("time_constant_s", "s", "its time constant"),
-    ),
-    "third_relaxation": (
-        Field("share", "1", "share of the force that settles more slowly still"),
-        Field("time_constant_s", "s", "its time constant"),
-    ),
-    "signal_delay": (Field("delay_s", "s", "age of the measured motor angle, up to 15 ms"),),
-    "backlash": (Field("play_rad", "rad", "motor angle lost at each reversal"),),
-    "friction_coefficient_fade": (
-        Field("fade_per_K", "1/K", "relative loss of pad friction above the onset"),
-        Field("onset_C", "degC", "pad surface temperature at which it begins"),
-    ),
-    "disc_radiation": (Field("area_m2", "m2", "radiating area times emissivity, in addition to the plant's own"),),
-    "thermocouple_lag": (Field("lag_s", "s", "first-order lag of the backplate thermocouples"),),
-    # Not in the catalogue.
-    "clamp_creep": (
-        Field("share", "1", "share of the force that creeps in"),
-        Field("time_constant_s", "s", "its time constant, tens of seconds"),
-    ),
-    "brake_torque_coupling": (Field("per_Nm", "1/(N m)", "relative gain of clamp force with brake torque"),),
-    "caliper_softening": (Field("per_K", "1/K", "relative loss of stiffness as the caliper warms over 22 degC"),),
-    "spindle_lead_error": (
-        Field("amplitude_um", "um", "travel error over the spindle's turn"),
-        Field("order_per_turn", "1", "periods per motor turn"),
-        Field("phase_rad", "rad", "phase"),
-    ),
-    "cold_grease": (
-        Field("per_K", "1/K", "relative rise of gear friction as the caliper cools below 22 degC"),
-        Field("viscous_Nms_per_rad", "N m s/rad", "viscous friction at 12 degC, doubling every further 10 K down"),
-    ),
-    # Effects drawn by a seed: size × shape(signal) × other signal, through a lag. Signals by their index in `brake.SIGNALS`.
-    **{
-        f"drawn_{port}": (
-            Field("size", unit, f"of what is added to {what} where the signals are at their usual sizes"),
-            Field("signal", "1", "index of the signal"),
-            Field("shape", "1", "0: a power of the signal; 1: it saturates; 2: it begins at the signal's usual size"),
-            Field("exponent", "1", "of the signal, for a power"),
-            Field("other", "1", "index of a second signal that multiplies, negative for none"),
-            Field("lag_s", "s", "time constant, 0 for none"),
-        )
-        for port, unit, what in (
-            ("stiffness", "1", "the stiffness factor"),
-            ("thickness", "um", "disc and pads"),
-            ("torque_constant", "1", "the torque constant's factor"),
-            ("gear_friction", "1", "the gear friction's factor"),
-            ("gear_gain", "1", "the load's factor"),
-            ("pad_friction", "1", "the pads' friction's factor"),
-            ("contact_conductance", "1", "the factor on the conductance of pressed pads to the disc"),
-            ("gap_conductance", "1", "the same across the gap"),
-            ("disc_cooling", "1", "the factor on the disc's convection"),
-            ("heat_share", "1", "the factor on the pads' share of the friction power"),
-            ("disc_heat", "W", "the heat into the disc"),
-            ("pad_conductivity", "1", "the factor on the pads' conductivity"),
-        )
-    },
-    "current_delay": (Field("delay_s", "s", "by which the mean of the measured current ends early, up to 12 ms"),),
-}
+}  # fmt: skip
 
-EFFECT_VALUES = np.dtype(
-    [(name, np.dtype([(f.name, "f8") for f in fields], align=True)) for name, fields in EFFECTS.items()], align=True
-)
+EFFECT_VALUES = np.dtype([(name, fields("f8", " ".join(names))) for name, names in EFFECTS.items()], align=True)
 
 #: Parameters of one corner's brake.
 PLANT_FIELDS = (
@@ -273,8 +201,6 @@ CAR = np.dtype(
         *fields("f8", "speed wheel_speed"),
         # kg carried by the simulated corners, m, N/(m/s)^2, N, m/s^2
         *fields("f8", "mass wheel_radius drag rolling acceleration supply_voltage"),
-        # s; messages leave up to this late after their sample.
-        ("jitter", "f8"),
         ("counter", "i8", (SLOTS,)),
         ("reference", "?"),
     ],
@@ -288,7 +214,7 @@ TRUTH = np.dtype(
         *fields("f8", "force static_force angle speed current contact_angle stiffness_factor brake_torque"),
         ("surface", "f8", (2,)),
         ("mean", "f8", (2,)),
-        ("depth", "f8", (2, len(PAD_DEPTHS_M))),
+        ("depth", "f8", (2, len(DEPTHS_M))),
         ("plate", "f8", (2,)),
         *fields("f8", "caliper disc wheel_speed wheel_angle vehicle_speed wear"),
         *fields("i8", "park_brake brake_request"),

@@ -19,7 +19,7 @@ GRID = "#e6e9ee"
 SCREEN_POINTS = 3000
 #: Largest number of samples of a figure that the page stores for zooming: six megabytes.
 DETAIL_SAMPLES = 1_000_000
-#: Quantiles of a band's edges that an axis reaches to: the widest hundredth is of a start.
+#: Quantiles of a band's edges that an axis covers. The widest hundredth comes from power-on (`_extent`).
 _IN_BAND = (0.01, 0.99)
 
 
@@ -64,15 +64,14 @@ class Panel:
     height: int = 260
 
 
-def decimate(x: np.ndarray, y: np.ndarray, points: int = SCREEN_POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """At most about ``points`` of a curve, smallest and largest of every bucket, so that no peak is lost.
+def decimate(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most about `SCREEN_POINTS` of a curve, smallest and largest of every bucket, so that no peak is lost.
 
     A bucket that is entirely NaN remains a gap."""
     x, y = np.asarray(x), np.asarray(y, dtype=float)
-    if len(y) <= points:
+    if len(y) <= SCREEN_POINTS:
         return x, y
-    buckets = points // 2
-    edges = np.linspace(0, len(y), buckets + 1).astype(np.int64)
+    edges = np.linspace(0, len(y), SCREEN_POINTS // 2 + 1).astype(np.int64)
     rows = []
     for begin, end in pairwise(edges):
         part = y[begin:end]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from emb_daemon.adapt.memory import Entry, Store
 
 #: Shortest interval that is visible on the complete time axis, as a share of it; intervals closer together are drawn as one.
-_SEEN = 1.0 / 1000.0
+_VISIBLE = 1.0 / 1000.0
 _BINS = 120
 _LABELS = {"fused": "estimate", "stiffness": "stiffness path", "torque": "torque path"}
 _STIFFNESS, _TORQUE = Style("#7fa7d1", 1.0), Style("#c2662d", 1.2, "dot")
@@ -37,7 +37,7 @@ def stretches(time_s: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.nd
     begin, end = time_s[np.flatnonzero(edges == 1)], time_s[np.flatnonzero(edges == -1) - 1]
     if not len(begin):
         return begin, end
-    least = max(CYCLE_S, _SEEN * float(time_s[-1] - time_s[0]))
+    least = max(CYCLE_S, _VISIBLE * float(time_s[-1] - time_s[0]))
     apart = np.concatenate([[True], begin[1:] - end[:-1] > least])
     first = np.flatnonzero(apart)
     last = np.concatenate([first[1:] - 1, [len(begin) - 1]])
@@ -197,15 +197,13 @@ def _curve(name: str, coefficients: np.ndarray, top_N: float, style: Style) -> T
 
 
 def replay_page(
-    results: Sequence[Result], corner: str, described: str, learned: "Store | None" = None,
-    calibration: Calibration | None = None,
-) -> Page:  # fmt: skip
+    results: Sequence[Result], corner: str, calibration: Calibration, described: str, learned: "Store | None" = None
+) -> Page:
     """The page of one or more `replay.Result`, in sequence as one drive.
 
     Args:
-        described: the calibration, in words.
+        calibration: of the file; ``described`` in words.
         learned: `adapt.memory.Store` of the corner after the drive, if it adapts.
-        calibration: the one with which the learned values are compared.
     """
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
