@@ -308,12 +308,14 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
     if np.sum(np.abs(np.diff(way))) < _PASSES * np.ptp(way):
         return []
 
-    def left_N(lag_s: float) -> float:
+    def left_N(lag_s: float, each_way: bool = False) -> float:
         at = angle.sampled(times - round(1e9 * lag_s))
         known = np.isfinite(at)
         if np.sum(known) < _LEAST or not np.ptp(at[known]) or at[known] @ (values[known] - np.mean(values[known])) < 0.0:
             return np.inf
         part = np.minimum(_CURVE_PARTS * (at[known] - at[known].min()) / np.ptp(at[known]), _CURVE_PARTS - 1).astype(int)
+        if each_way:
+            part += _CURVE_PARTS * (np.gradient(at[known]) < 0.0)
         means = np.bincount(part, values[known]) / np.maximum(np.bincount(part), 1)
         return float(np.std(values[known] - means[part]))
 
@@ -328,7 +330,8 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
             f"ClampForceRef comes {1e3 * lag_s:.0f} ms after the motor's angle that it belongs to, and pads explain some "
             f"{1e3 * _RELAXES_S:.0f} ms: `mean_ms: {2e3 * (lag_s - _RELAXES_S):.0f}` of it, twice a delay, takes the rest back"
         ]
-    if lag_s < -_EARLY_S and gain > _EARLY_BETTER:
+    # What rubs or has play makes a loop: more force on the way to it than back, as if it came first.
+    if lag_s < -_EARLY_S and gain > _EARLY_BETTER and np.min(left) < left_N(0.0, each_way=True):
         return [
             f"ClampForceRef comes {-1e3 * lag_s:.0f} ms before the motor's angle that it belongs to, as of no brake: were the "
             "two stamped by two clocks?"
