@@ -287,9 +287,10 @@ def test_a_loop_over_the_angle_is_no_other_clock(stroke):
     play = [0.0]
     for step in np.diff(angle):
         play.append(min(max(play[-1] + step, -1.0), 1.0))
-    force = 500.0 * np.maximum(angle + play - 3.0, 0.0) + np.random.default_rng(1).normal(0.0, 20.0, len(angle))
-    times = 4_000_000 * np.arange(len(angle))
-    assert _find_late_force(Series(times, angle), Series(times, force)) == []
+    noise, times = np.random.default_rng(1).normal(size=(2, len(angle))), 4_000_000 * np.arange(len(angle))
+    force = 500.0 * np.maximum(angle + play - 3.0, 0.0) + 20.0 * noise[0]
+    coarse = 0.05 * np.round(angle / 0.05 + 0.3 * noise[1])
+    assert _find_late_force(Series(times, coarse), Series(times, force)) == []
 
 
 @pytest.mark.parametrize(
