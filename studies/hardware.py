@@ -7,7 +7,8 @@ Each set is optional; what `tools/` needs of each is said there, with sources. L
 Cranfield ball screw: the load of runs 6 to 10 is estimated without being given, by the pairs of clamping and releasing passes
 that park brake training starts with (`adapt.pairs`), scaled on the normal runs 1 to 5. Beside it the best fit of each stroke
 alone, from the same runs, which cannot know that friction has changed. Friction is called changed where it leaves the scatter
-of the normal runs.
+of the normal runs, and so is what it varies by once a turn of the screw: a balls' track broken at one place is passed once a
+turn, wherever the nut is, and a lack of grease everywhere.
 
 EMBiR dynamometer: `emb-daemon diagnose` on the first half of a run, judged on the second, and on runs of other days. Geared
 robot motor: the same of every run, each judged on its own second half.
@@ -27,6 +28,7 @@ from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main as emb_daemon
 from emb_daemon.offline.log import load_log, log_of
+from emb_daemon.offline.score import rmse
 from studies.plain import plain_fits
 
 _TOOLS = Path(__file__).parent.parent / "tools"
@@ -40,6 +42,9 @@ _MATTERS = 0.05
 #: A run of steps of the current against a damping load, and runs of other days.
 EMBIR = "27_04_2021_16-28-22"
 EMBIR_SLOW = "23_04_2021_16-51-18"
+#: Orders about a screw's turn: what noise and a stroke's ends leave at the turn itself. A stroke of so many turns tells them
+#: apart.
+_BESIDE, _TURNS = (0.75, 0.85, 1.15, 1.25), 8.0
 EMBIR_OTHERS = ("23_04_2021_19-57-18", "11_05_2021_18-12-52", "24_05_2021_15-00-36")
 
 
@@ -53,8 +58,9 @@ def tool(name: str):
 # -- Cranfield --------------------------------------------------------------------------------------------------------
 
 
-def passes(part: dict, load_kgf: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of one run whose load is not given: the pairs of its passes, and the mean signed current of clamping and releasing."""
+def passes(part: dict, load_kgf: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Of one run whose load is not given: the pairs of its passes, the mean signed current of clamping and releasing, and the
+    mean square (A²) of what it varies by once a turn of the screw, more than beside it."""
     cranfield = tool("cranfield_to_log")
     samples = log_of(cranfield.frames(part, load_kgf, with_load=False)).samples
     rows = np.zeros(len(samples), TRAINING)
@@ -63,7 +69,21 @@ def passes(part: dict, load_kgf: int) -> tuple[np.ndarray, np.ndarray]:
             rows[name] = samples[name]
     current = samples["current_q"][samples["has_current"]]
     pairs = pairs_of_passes(rows, np.atleast_1d(to_parameters(cranfield.calibration_to_start_from()))[0])
-    return pairs, np.array([current[current > 0.0].mean(), current[current < 0.0].mean()])
+    return pairs, np.array([current[current > 0.0].mean(), current[current < 0.0].mean()]), _once_a_turn(samples)
+
+
+def _once_a_turn(samples: np.ndarray) -> float:
+    """Mean over the strokes: the current's friction and load change slowly along one, and are taken out of it as a quartic."""
+    moving = np.flatnonzero(samples["has_current"])
+    found = []
+    for stroke in np.split(moving, np.flatnonzero(np.diff(moving) > 1) + 1):
+        x, current = samples["angle"][stroke], samples["current_q"][stroke]
+        if np.ptp(x) < 2.0 * np.pi * _TURNS:
+            continue
+        rest = current - np.polynomial.Polynomial.fit(x, current, 4)(x)
+        power = [abs(2.0 * np.mean(np.exp(-1j * order * x) * rest)) ** 2 for order in (1.0, *_BESIDE)]
+        found.append(power[0] - np.mean(power[1:]))
+    return float(np.mean(found))
 
 
 def _line(table: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -75,24 +95,34 @@ def cranfield(folder: Path) -> list[str]:
     reading, found = tool("cranfield_to_log").read, {}
     for state in STATES:
         for (load, run), part in reading(folder / f"{state}.csv").items():
-            pairs, currents = passes(part, load)
+            pairs, currents, turn = passes(part, load)
             force, friction = (np.average(pairs[:, column], weights=pairs[:, WEIGHT]) for column in (FORCE, FRICTION))
             # The actuator's own direction, in which loads have both signs: what is clamped counts against it.
             sign = np.sign(load)
-            found[state, load, run] = sign * force, friction, sign * currents
+            found[state, load, run] = sign * force, friction, sign * currents, turn
     loads = sorted({load for _, load, _ in found})
     fit = [(load, *found["normal", load, run]) for load in loads for run in _FIT]
     wanted = np.array([load for load, *_ in fit], float)
     pair = _line(np.array([[force, 1.0] for _, force, *_ in fit]), wanted)
-    strokes = [_line(np.array([_plain(c[way]) for *_, c in fit]), wanted) for way in range(2)]
+    strokes = [_line(np.array([_plain(currents[way]) for _, _, _, currents, _ in fit]), wanted) for way in range(2)]
     normal = {load: np.array([found["normal", load, run][1] for run in _FIT]) for load in loads}
-    lines = ["| state | stroke alone, kgf | pairs of passes, kgf | friction changed, runs |", "|---|---|---|---|"]
+
+    def turn(state: str, run: int) -> float:
+        """Amplitude once a turn in A, mean over the loads."""
+        return float(np.mean([max(found[state, load, run][3], 0.0) ** 0.5 for load in loads if (state, load, run) in found]))
+
+    usual = np.array([turn("normal", run) for run in _FIT])
+    broken = usual.mean() + _CHANGED * usual.std(ddof=1)
+    lines = [
+        "| state | stroke alone, kgf | pairs of passes, kgf | friction changed, runs | once a turn, mA | more, runs |",
+        "|---|---|---|---|---|---|",
+    ]
     for state in STATES:
         errors, plain, changed = [], [], []
         for run in _JUDGE:
             beyond = []
             for load in loads:
-                force, friction, currents = found[state, load, run]
+                force, friction, currents, _ = found[state, load, run]
                 errors.append(pair @ [force, 1.0] - load)
                 plain += [strokes[way] @ _plain(currents[way]) - load for way in range(2)]
                 change = friction - normal[load].mean()
@@ -101,17 +131,17 @@ def cranfield(folder: Path) -> list[str]:
             changed.append(max(beyond, key=abs))
         count = int(np.sum(np.abs(changed) > _MATTERS))
         way = "" if not count else " up" if np.mean(changed) > 0.0 else " down"
-        lines.append(f"| {state} | {_rms(plain):.1f} | {_rms(errors):.1f} | {count}/{len(changed)}{way} |")
+        turns = np.array([turn(state, run) for run in _JUDGE])
+        lines.append(
+            f"| {state} | {rmse(plain):.1f} | {rmse(errors):.1f} | {count}/{len(changed)}{way} | {1e3 * turns.mean():.0f} "
+            f"| {np.sum(turns > broken)}/{len(turns)} |"
+        )
     return lines
 
 
 def _plain(current: float) -> list[float]:
     """Regressors of the load on the mean current of a stroke: what three loads can fit."""
     return [current, current * current, 1.0]
-
-
-def _rms(values) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 # -- EMBiR ------------------------------------------------------------------------------------------------------------

@@ -393,21 +393,26 @@ def test_a_log_too_slow_to_be_judged_is_no_diagnosis_of_nothing():
         diagnose([log], stated)
 
 
-def test_the_load_of_a_screw_comes_out_of_its_passes_whatever_its_friction(tmp_path):
+def test_the_load_of_a_screw_and_what_breaks_it_come_out_of_its_passes_whatever_its_friction(tmp_path):
     tool, rows = study.tool("cranfield_to_log"), []
     clock = np.arange(0.0, 16.0, 0.04)
     position = np.clip(np.where(clock < 8.0, 20.0 + 24.0 * clock, 140.0 - 24.0 * (clock - 8.0)), 20.0, 140.0)
     direction = np.sign(np.gradient(position))
+    # A broken track is passed once a turn; along a stroke the friction changes by much more, but slowly.
+    slow = 0.3 * np.sin(0.02 * position)
+    ripple = {20: slow + 0.01 * np.cos(2.0 * np.pi * position / 5.0), 40: slow}
     for load in (20, 40):
         # Amperes of supply per kgf of load, and of friction.
-        current = tool.STANDSTILL_A + np.where(direction == 0.0, 0.0, 0.6 - direction * 0.005 * load)
+        current = tool.STANDSTILL_A + np.where(direction == 0.0, 0.0, 0.6 - direction * 0.005 * load + ripple[load])
         rows += [f"{p},0.0,{i},trap,{load},1,0,1,{t}" for p, i, t in zip(position, current, clock, strict=True)]
     header = "set_point,position_error,current,profile,load,run,fault_type,group,time"
     (tmp_path / "normal.csv").write_text("\n".join([header, *rows]))
-    found = {load: study.passes(part, load)[0] for (load, _), part in tool.read(tmp_path / "normal.csv").items()}
-    force = {load: np.average(pairs[:, study.FORCE], weights=pairs[:, study.WEIGHT]) for load, pairs in found.items()}
+    passes = {load: study.passes(part, load) for (load, _), part in tool.read(tmp_path / "normal.csv").items()}
+    force = {load: np.average(pairs[:, study.FORCE], weights=pairs[:, study.WEIGHT]) for load, (pairs, *_) in passes.items()}
     constant = tool.NOMINAL_CONSTANT / tool.GEAR_GAIN_M_PER_RAD
     assert force == pytest.approx({load: 0.005 * load * constant for load in (20, 40)}, rel=0.02)
+    # Straight lines between values of the table take a tenth of the ripple.
+    assert passes[20][2] ** 0.5 == pytest.approx(0.89 * 0.01, rel=0.2) and abs(passes[40][2]) < 0.002**2
 
 
 @pytest.mark.parametrize(

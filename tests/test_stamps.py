@@ -279,6 +279,20 @@ def test_a_force_of_another_clock_is_said(truth, tmp_path, capsys, late_s, said)
     assert bool(said) == ("that it belongs to" in told)
 
 
+@pytest.mark.parametrize("stroke", [[0.0, 20.0, 0.0], [0.0, 20.0, 20.0, 0.0]], ids=["to and fro", "held"])
+def test_a_loop_over_the_angle_is_no_other_clock(stroke):
+    """Rubber, or a gear with play: on the way to a force there is more of it than back, at any speed."""
+    time_s = 0.004 * np.arange(6000)
+    angle = np.interp(time_s % 12.0, np.linspace(0.0, 12.0, len(stroke)), stroke)
+    play = [0.0]
+    for step in np.diff(angle):
+        play.append(min(max(play[-1] + step, -1.0), 1.0))
+    noise, times = np.random.default_rng(1).normal(size=(2, len(angle))), 4_000_000 * np.arange(len(angle))
+    force = 500.0 * np.maximum(angle + play - 3.0, 0.0) + 20.0 * noise[0]
+    coarse = 0.05 * np.round(angle / 0.05 + 0.3 * noise[1])
+    assert _find_late_force(Series(times, coarse), Series(times, force)) == []
+
+
 @pytest.mark.parametrize(
     ("factor", "is_said"), [(1.0, False), (3.6, True), (1.0 / 3.6, True)], ids=["m/s", "km/h as m/s", "rad/s from km/h"]
 )

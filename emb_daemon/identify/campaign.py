@@ -27,6 +27,8 @@ NEED_INTEGRATED = "training and braking heat at full frame rate"
 _LEAST_SAMPLES, _LONGEST_CYCLE_S, _LEAST_FORCE = 500, 0.0041, 0.1
 #: Correlation of force and angle below minus which the sign of one is wrong; curves have 0.9 and more.
 _AGAINST = 0.5
+#: Samples with a reference force before which the motor has not left its place: 80 ms.
+_AT_REST = 20
 #: Relative difference of a disc's speed from the campaign's at which a log is another one.
 _SPEED_TOLERANCE = 0.2
 
@@ -47,12 +49,12 @@ def _turning_points(angle, threshold):
     return count
 
 
-def _excitation(log: Log, clearance_rad: float) -> tuple[float, float, float]:
+def _excitation(log: Log, clearance_rad: float) -> tuple[float, bool, float]:
     """How much a log moves the brake; ``clearance_rad`` is the datasheet's, of which the first half is certainly free of
     contact.
 
     Returns:
-        (largest reference force in N, its standard deviation before the pads first touch, turning points of the motor angle by
+        (largest reference force in N, whether there are some before the pads first touch, turning points of the motor angle by
         more than a twentieth of its travel per second of motion).
     """
     angle, force = log.samples["angle"], log.force_N
@@ -61,9 +63,8 @@ def _excitation(log: Log, clearance_rad: float) -> tuple[float, float, float]:
     moving = float(np.sum(log.samples["dt"][1:][np.diff(angle) != 0.0]))
     left = np.flatnonzero(angle - angle[0] > 0.5 * clearance_rad)
     known = np.isfinite(force)
-    free = known & (np.arange(len(angle)) < (left[0] if len(left) else 0))
-    noise_N = float(np.std(force[free])) if free.sum() > 20 else np.nan
-    return float(force[known].max()), noise_N, reversals / moving if moving > 0.0 else 0.0
+    rests = len(left) > 0 and np.sum(known[: left[0]]) > _AT_REST
+    return float(force[known].max()), bool(rests), reversals / moving if moving > 0.0 else 0.0
 
 
 def _runs_against(log: Log) -> bool:
@@ -166,7 +167,7 @@ class Campaign:
         if log is None:
             return None
         actuator = self.datasheet.actuator
-        force_N, noise_N, reversals_per_s = _excitation(log, actuator.pad_clearance_rad)
+        force_N, rests, reversals_per_s = _excitation(log, actuator.pad_clearance_rad)
         cycle = float(np.median(log.samples["dt"][1:])) if len(log.samples) > 1 else np.inf
         lacking = None
         if len(log.samples) < _LEAST_SAMPLES or cycle > _LONGEST_CYCLE_S:
@@ -176,10 +177,10 @@ class Campaign:
                 lacking += ", and the way between two is unknown; expected 100 Hz or a slower motion"
         elif not force_N > _LEAST_FORCE * actuator.rated_clamp_force_N:
             lacking = f"clamp force reaches only {1e-3 * force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
-        elif not np.isfinite(noise_N):
-            lacking = "does not begin with the brake released"
-            if _runs_against(log):
-                lacking = "the force falls where the motor angle rises: turn the angle round (`scale: -1` of the mapping)"
+        elif _runs_against(log):
+            lacking = "the force falls where the motor angle rises: turn the angle round (`scale: -1` of the mapping)"
+        elif not rests:
+            lacking = "does not begin with the motor at rest in the released position"
         elif not reversals[0] <= reversals_per_s <= reversals[1]:
             lacking = (
                 f"motor turns round {reversals_per_s:.2f} times per second, "

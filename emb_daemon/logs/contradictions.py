@@ -49,8 +49,9 @@ _ANEW, _LEAST_JUMPS, _ON = 0.5, 3, 0.8
 #: How late a force follows the motor's angle where pads relax, s, and how late it may by no pads in motion that tells it; a
 #: force before its angle is another clock's. Largest delay that is looked for, and step of the search, s.
 _RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0.5, 0.01
-#: How often the travel must be passed, and of how many samples that is added up, so that noise adds nothing.
-_PASSES, _PLACES = 1.5, 400
+#: How often the travel must be passed, of how many samples that is added up, so that noise adds nothing, and time before and
+#: after, s, between which an angle's way is told, for the same reason.
+_PASSES, _PLACES, _WAY_S = 1.5, 400, 0.1
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
 #: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
 _LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
@@ -308,12 +309,15 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
     if np.sum(np.abs(np.diff(way))) < _PASSES * np.ptp(way):
         return []
 
-    def left_N(lag_s: float) -> float:
+    def left_N(lag_s: float, each_way: bool = False) -> float:
         at = angle.sampled(times - round(1e9 * lag_s))
         known = np.isfinite(at)
         if np.sum(known) < _LEAST or not np.ptp(at[known]) or at[known] @ (values[known] - np.mean(values[known])) < 0.0:
             return np.inf
         part = np.minimum(_CURVE_PARTS * (at[known] - at[known].min()) / np.ptp(at[known]), _CURVE_PARTS - 1).astype(int)
+        if each_way:
+            span = round(1e9 * _WAY_S)
+            part += _CURVE_PARTS * (angle.sampled(times + span) < angle.sampled(times - span))[known]
         means = np.bincount(part, values[known]) / np.maximum(np.bincount(part), 1)
         return float(np.std(values[known] - means[part]))
 
@@ -328,7 +332,8 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
             f"ClampForceRef comes {1e3 * lag_s:.0f} ms after the motor's angle that it belongs to, and pads explain some "
             f"{1e3 * _RELAXES_S:.0f} ms: `mean_ms: {2e3 * (lag_s - _RELAXES_S):.0f}` of it, twice a delay, takes the rest back"
         ]
-    if lag_s < -_EARLY_S and gain > _EARLY_BETTER:
+    # What rubs or has play makes a loop: more force on the way to it than back, as if it came first.
+    if lag_s < -_EARLY_S and gain > _EARLY_BETTER and np.min(left) < left_N(0.0, each_way=True):
         return [
             f"ClampForceRef comes {-1e3 * lag_s:.0f} ms before the motor's angle that it belongs to, as of no brake: were the "
             "two stamped by two clocks?"
