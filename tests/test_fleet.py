@@ -309,7 +309,7 @@ def test_what_a_batch_shares_is_found_with_its_cause_and_size():
         values, prints, groups, factors = _fleet(np.random.default_rng(seed))
         values[groups["batch 1"]] += 3.0 * prints[4]
         values[groups["batch 2"]] -= 2.0 * prints[7]
-        found = population.shared_causes(values, groups, prints, _read(values, prints, factors)[1], beside=True)
+        found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
         assert {(one.group, one.cause) for one in found} == {("batch 1", 4), ("batch 2", 7)}
         for one in found:
             truth = 3.0 if one.cause == 4 else -2.0
@@ -326,7 +326,7 @@ def test_what_a_wrong_shape_leaves_is_no_second_cause():
             # As far from each other, and from others, as causes can be.
             prints[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
             values[groups["batch 1"]] += prints[4] + second * prints[9]
-            found = population.shared_causes(values, groups, prints, _read(values, prints, factors)[1], beside=True)
+            found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
             assert {one.cause for one in found} == named and {one.group for one in found} == {"batch 1"}, (seed, second)
 
 
@@ -336,7 +336,7 @@ def test_where_nothing_is_shared_nobody_is_accused():
     for seed in range(60):
         values, prints, groups, factors = _fleet(np.random.default_rng(1000 + seed))
         centre, readings = _read(values, prints, factors)
-        batches += bool(population.shared_causes(values, groups, prints, readings, beside=True))
+        batches += bool(population.shared_causes(values, groups, readings, beside=True))
         units += bool(population.outliers(values - centre, readings))
     # Binomial, 0.1 %.
     assert batches <= 5 and units <= 5
@@ -401,7 +401,7 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
     for _ in range(400):
         from_drive_to_drive = 0.3 * rng.standard_normal((4, 4))
         drives = _scores(rng, "u", lambda number, own=from_drive_to_drive: truth + own[number], 4)
-        units.append(population.unit_of(drives, flat, np.ones((4, 1))))
+        units.append(population.unit_of(drives, flat, np.ones((4, 1)), [np.eye(4)]))
     values, noise = np.array([unit.values[0] for unit in units]), np.array([np.diag(unit.noise[0]) for unit in units])
     np.testing.assert_allclose(values.mean(axis=0) / 50.0, truth, atol=0.03)
     np.testing.assert_allclose(noise.mean(axis=0), values.var(axis=0), rtol=0.15)
@@ -416,7 +416,7 @@ def test_who_asks_twice_as_many_questions_is_half_as_sure():
     for causes in (prints, np.concatenate([prints, prints])):
         centre, readings = _read(values, causes, factors)
         [unit] = [one for one in population.outliers(values - centre, readings) if one.row == 10]
-        batch = population.shared_causes(values, groups, causes, readings, beside=True)[0]
+        batch = population.shared_causes(values, groups, readings, beside=True)[0]
         chances.append((unit.chance, batch.chance))
     np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
     assert min(chances[0]) > 0.0
