@@ -465,29 +465,26 @@ def test_drift_and_season_are_told_apart_with_their_sizes(per_30_days, per_10_K)
     assert not found.groups and not found.outliers
 
 
-def test_a_misfit_is_no_season_where_a_cause_acts_by_temperature():
-    """The second cause is the first one times the temperature but for a twentieth, and a tenth of a usual effect, alike in all
-    drives, looks like this twentieth: two amounts of two effects would cancel each other and leave it. The third cause has a
-    season."""
-    rng, fleet = np.random.default_rng(2), {}
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_misfit_is_no_season_where_a_cause_acts_by_temperature(seed):
+    """The second cause is the first one times the temperature but for a tenth, and a fifth of a usual effect, alike in all
+    drives, looks like this tenth: large amounts of both would cancel each other and leave it. The third cause has a season."""
+    rng, fleet = np.random.default_rng(seed), {}
     for number in range(14):
         unit, drives = f"unit-{number}", []
         level, warmth = 0.05 * rng.standard_normal(4), 15.0 + 6.0 * rng.standard_normal(12)
         for day in range(12):
-            table, own, change = (
-                50.0 * rng.standard_normal((200, 4)),
-                50.0 * rng.standard_normal(200),
-                (warmth[day] - 15.0) / 10.0,
-            )
-            table[:, 1] = change * table[:, 0] + 0.05 * own
-            residual = table @ level + 0.5 * change * table[:, 2] + 0.1 * own + 20.0 * rng.standard_normal(200)
+            table, own = 50.0 * rng.standard_normal((200, 4)), 50.0 * rng.standard_normal(200)
+            change = (warmth[day] - 15.0) / 10.0
+            table[:, 1] = change * table[:, 0] + 0.1 * own
+            residual = table @ level + 0.2 * change * table[:, 2] + 0.2 * own + 20.0 * rng.standard_normal(200)
             table = np.column_stack([table, residual])
             drive = dataset.Drive(unit, "FL", "", day * 86_400_000_000_000, f"{day:016x}")
             drives.append(scores.Score(drive, table.T @ table, 200, warmth[day]))
         fleet[unit, "FL"] = drives
     causes = [scores.Cause(f"effects.{name}", name, None, "1") for name in "abcd"]
     [season] = findings.find(fleet, causes, "", {}, {}).seasons
-    assert season.cause == "c" and season.amount == pytest.approx(0.5, rel=0.1)
+    assert season.cause == "c" and season.amount == pytest.approx(0.2, rel=0.15)
 
 
 # -- end to end -------------------------------------------------------------------------------------------------------
