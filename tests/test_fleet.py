@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 
 from emb_daemon.calibration.files import load_calibration, save_calibration
@@ -81,6 +82,22 @@ def test_estimates_of_a_fleet_are_those_of_replay_to_the_last_byte(tmp_path, log
     assert figures["samples"] == 750 and figures["refused"] == {}
 
 
+def test_the_clamp_force_of_a_rig_is_beside_the_estimates(tmp_path, calibration):
+    """Of the reference instruments a data set keeps this one, as replay writes it."""
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    schedule = sc.rest(0.5) + sc.stop(7000.0, 2.0) + sc.rest(0.5)
+    frames, _ = simulate_log(plant_from_calibration(calibration, 1), schedule)
+    (folder / "drive.log").write_text(format_candump(frames))
+    _ingested(tmp_path / "fleet", folder)
+    [drive] = dataset.drives(tmp_path / "fleet")
+    assert replay_drive(tmp_path / "fleet", drive, calibration)["force_N"]
+    assert main(["replay", str(folder / "drive.log"), "--output", str(tmp_path / "single.parquet")]) == 0
+    [written] = (tmp_path / "fleet/estimates").rglob("*.parquet")
+    single, fleet = (pyarrow.parquet.ParquetFile(path).read() for path in (tmp_path / "single.parquet", written))
+    assert "clamp_force_ref_N" in fleet.column_names and single.select(fleet.column_names).equals(fleet)
+
+
 def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, scheduler, calibration):
     source = tmp_path / "logs/car"
     source.mkdir(parents=True)
@@ -99,6 +116,10 @@ def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, sch
     samples = dataset.read_drive(tmp_path / "fleet", drive)[0].samples
     assert len(samples) == 750
     assert not [name for name in _content(tmp_path / "fleet") if half.digest in name], "the report would count both"
+    # Written again, of the same size.
+    assert jobs(tmp_path / "fleet", [log]) == []
+    os.utime(log, ns=(0, log.stat().st_mtime_ns + 1))
+    assert [job.path for job in jobs(tmp_path / "fleet", [log])] == [log]
 
 
 def test_copies_of_a_log_are_one_drive_of_each_unit(tmp_path, logs):
