@@ -508,6 +508,22 @@ def test_a_misfit_is_no_season_where_a_cause_acts_by_temperature(seed):
     assert season.cause == "c" and season.amount == pytest.approx(0.2, rel=0.15)
 
 
+def test_a_slope_is_of_what_changes_within_units_wherever_they_are():
+    """Units in the north and in the south, whose own temperature changes alike."""
+    rng = np.random.default_rng(0)
+    drives = [_scores(rng, f"unit-{number}", lambda drive: np.zeros(4), 12) for number in range(6)]
+    flat = population.Directions(np.eye(4) / np.sqrt(200.0) / 50.0, np.eye(4), np.ones(4))
+    warmth = [place + 0.3 * rng.standard_normal(12) for place in (-2.0, -2.0, 0.0, 0.0, 2.0, 2.0)]
+    assert population.changing(drives, flat, warmth).shape == (4, 4)
+
+
+def test_a_cause_that_is_mostly_a_level_of_others_has_no_slope():
+    prints = np.array([[1.0, 0.0], [1.0, 1.0], [0.1, 1.0]])
+    directions = population.Directions(np.eye(2), prints, np.ones(3))
+    np.testing.assert_array_equal(directions.prints_in(np.array([[1.0], [0.0]])), [[1.0], [1.0], [0.0]])
+    np.testing.assert_array_equal(directions.prints_in(np.eye(2)), prints)
+
+
 # -- end to end -------------------------------------------------------------------------------------------------------
 
 

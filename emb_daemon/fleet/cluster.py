@@ -25,7 +25,6 @@ _PATIENCE_S, _WITHOUT_WORKERS = 10, 6
 #: Settings of Dask. A task takes seconds: scheduler and two workers that watch themselves up to a hundred times a second take
 #: a sixth of a core with nothing to do.
 _SETTINGS = {
-    "distributed.scheduler.allowed-failures": _LIVES,
     "distributed.admin.large-graph-warning-threshold": "1GB",
     "distributed.admin.tick.interval": "500ms",
     "distributed.admin.system-monitor.interval": "5s",
@@ -54,7 +53,7 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
     import dask
     from distributed import Client, LocalCluster
 
-    with dask.config.set(_SETTINGS):
+    with dask.config.set(_SETTINGS | {"distributed.scheduler.allowed-failures": _LIVES}):
         if address:
             try:
                 client = Client(address, timeout=_PATIENCE_S)
