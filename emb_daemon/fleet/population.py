@@ -195,7 +195,8 @@ class Readings:
         )
         along = np.einsum("fab,kb->fka", self._inverse, prints)
         self.filters: np.ndarray = (along / np.maximum(np.einsum("fka,ka->fk", along, prints), 1e-300)[:, :, None])[fold]
-        self.prints, self._noise = prints, noise
+        self.prints: np.ndarray = prints
+        self._noise = noise
         self.inverse: np.ndarray = self._inverse.mean(axis=0)
 
     def of(self, units: np.ndarray) -> np.ndarray:
