@@ -18,7 +18,6 @@ from resource import RUSAGE_CHILDREN, getrusage
 from statistics import median
 from typing import TYPE_CHECKING
 
-import can
 import psutil
 
 from emb_daemon.calibration.files import load_calibration
@@ -27,7 +26,6 @@ from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.dataset import DIGEST, Drive, read_drive, write_drive
 from emb_daemon.fleet.ingest import Job, ingest
 from emb_daemon.fleet.replaying import replay_drive
-from emb_daemon.fleet.scores import Scorer
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.read import log_ending, read_file, read_frames, read_log, unpack
 from emb_daemon.logs.write import write_frames
@@ -64,6 +62,9 @@ def stages(path: Path, calibration: Calibration) -> list[Stage]:
     Raises:
         InputError: not readable, or without samples.
     """
+    # Not imported by the workers, whose memory would not be a fleet's.
+    from emb_daemon.fleet.scores import Scorer
+
     raw, frames = read_file(path), read_frames(path)
     corner = corners_in(frames, path)[0]
     parameters = to_parameters(calibration)
@@ -103,6 +104,8 @@ def readings(path: Path) -> Iterator[Reading]:
     Raises:
         InputError: not readable.
     """
+    import can
+
     frames = read_frames(path)
     seconds = 1e-9 * float(frames["time_ns"][-1] - frames["time_ns"][0])
     readers = {".log": can.CanutilsLogReader, ".blf": can.BLFReader, ".mf4": can.MF4Reader}

@@ -132,6 +132,22 @@ def test_a_motor_that_stands_tells_nothing_and_one_stroke_tells_enough():
     assert _compare(_late(stroke, 2.0), stroke, a) == pytest.approx(2.0, abs=0.1)
 
 
+def test_after_one_filter_was_undone_the_next_is_found_as_soon_as_a_first_one():
+    a, fresh = np.zeros(2, ALIGNMENT)
+    assert _compare(*_apart(_torque(), -2.0), a, 0.0) < 0.0
+    a["angle"] = 0.0
+    align(a, np.zeros(1, SAMPLE)[0])
+    assert a["lag"] < 0.0
+    a["angle"][0] = fresh["angle"][0] = 1.0
+    found = 0
+    for shown, needed in zip(*_apart(_torque(seed=4), -4.0), strict=True):
+        for one in (a, fresh):
+            compare(one, shown, needed, 0.0, _NOISE)
+        assert (a["late"], a["slow"]) == (fresh["late"], fresh["slow"])
+        found += fresh["slow"] < 0.0
+    assert found > 100
+
+
 def test_until_changes_were_seen_to_belong_together_a_torque_that_changed_waits():
     """For a contact angle that is not known yet: a late current would pass for a clamp force."""
     a = np.zeros(1, ALIGNMENT)[0]

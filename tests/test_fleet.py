@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 
 from emb_daemon.calibration.files import load_calibration, save_calibration
@@ -81,6 +82,22 @@ def test_estimates_of_a_fleet_are_those_of_replay_to_the_last_byte(tmp_path, log
     assert figures["samples"] == 750 and figures["refused"] == {}
 
 
+def test_the_clamp_force_of_a_rig_is_beside_the_estimates(tmp_path, calibration):
+    """Of the reference instruments a data set keeps this one, as replay writes it."""
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    schedule = sc.rest(0.5) + sc.stop(7000.0, 2.0) + sc.rest(0.5)
+    frames, _ = simulate_log(plant_from_calibration(calibration, 1), schedule)
+    (folder / "drive.log").write_text(format_candump(frames))
+    _ingested(tmp_path / "fleet", folder)
+    [drive] = dataset.drives(tmp_path / "fleet")
+    assert replay_drive(tmp_path / "fleet", drive, calibration)["force_N"]
+    assert main(["replay", str(folder / "drive.log"), "--output", str(tmp_path / "single.parquet")]) == 0
+    [written] = (tmp_path / "fleet/estimates").rglob("*.parquet")
+    single, fleet = (pyarrow.parquet.ParquetFile(path).read() for path in (tmp_path / "single.parquet", written))
+    assert "clamp_force_ref_N" in fleet.column_names and single.select(fleet.column_names).equals(fleet)
+
+
 def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, scheduler, calibration):
     source = tmp_path / "logs/car"
     source.mkdir(parents=True)
@@ -99,6 +116,10 @@ def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, sch
     samples = dataset.read_drive(tmp_path / "fleet", drive)[0].samples
     assert len(samples) == 750
     assert not [name for name in _content(tmp_path / "fleet") if half.digest in name], "the report would count both"
+    # Written again, of the same size.
+    assert jobs(tmp_path / "fleet", [log]) == []
+    os.utime(log, ns=(0, log.stat().st_mtime_ns + 1))
+    assert [job.path for job in jobs(tmp_path / "fleet", [log])] == [log]
 
 
 def test_copies_of_a_log_are_one_drive_of_each_unit(tmp_path, logs):
@@ -309,7 +330,7 @@ def test_what_a_batch_shares_is_found_with_its_cause_and_size():
         values, prints, groups, factors = _fleet(np.random.default_rng(seed))
         values[groups["batch 1"]] += 3.0 * prints[4]
         values[groups["batch 2"]] -= 2.0 * prints[7]
-        found = population.shared_causes(values, groups, prints, _read(values, prints, factors)[1], beside=True)
+        found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
         assert {(one.group, one.cause) for one in found} == {("batch 1", 4), ("batch 2", 7)}
         for one in found:
             truth = 3.0 if one.cause == 4 else -2.0
@@ -326,7 +347,7 @@ def test_what_a_wrong_shape_leaves_is_no_second_cause():
             # As far from each other, and from others, as causes can be.
             prints[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
             values[groups["batch 1"]] += prints[4] + second * prints[9]
-            found = population.shared_causes(values, groups, prints, _read(values, prints, factors)[1], beside=True)
+            found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
             assert {one.cause for one in found} == named and {one.group for one in found} == {"batch 1"}, (seed, second)
 
 
@@ -336,7 +357,7 @@ def test_where_nothing_is_shared_nobody_is_accused():
     for seed in range(60):
         values, prints, groups, factors = _fleet(np.random.default_rng(1000 + seed))
         centre, readings = _read(values, prints, factors)
-        batches += bool(population.shared_causes(values, groups, prints, readings, beside=True))
+        batches += bool(population.shared_causes(values, groups, readings, beside=True))
         units += bool(population.outliers(values - centre, readings))
     # Binomial, 0.1 %.
     assert batches <= 5 and units <= 5
@@ -401,7 +422,7 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
     for _ in range(400):
         from_drive_to_drive = 0.3 * rng.standard_normal((4, 4))
         drives = _scores(rng, "u", lambda number, own=from_drive_to_drive: truth + own[number], 4)
-        units.append(population.unit_of(drives, flat, np.ones((4, 1))))
+        units.append(population.unit_of(drives, flat, np.ones((4, 1)), [np.eye(4)]))
     values, noise = np.array([unit.values[0] for unit in units]), np.array([np.diag(unit.noise[0]) for unit in units])
     np.testing.assert_allclose(values.mean(axis=0) / 50.0, truth, atol=0.03)
     np.testing.assert_allclose(noise.mean(axis=0), values.var(axis=0), rtol=0.15)
@@ -416,7 +437,7 @@ def test_who_asks_twice_as_many_questions_is_half_as_sure():
     for causes in (prints, np.concatenate([prints, prints])):
         centre, readings = _read(values, causes, factors)
         [unit] = [one for one in population.outliers(values - centre, readings) if one.row == 10]
-        batch = population.shared_causes(values, groups, causes, readings, beside=True)[0]
+        batch = population.shared_causes(values, groups, readings, beside=True)[0]
         chances.append((unit.chance, batch.chance))
     np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
     assert min(chances[0]) > 0.0
@@ -463,6 +484,44 @@ def test_drift_and_season_are_told_apart_with_their_sizes(per_30_days, per_10_K)
             assert one.amount == pytest.approx(truth, rel=0.15) and abs(one.amount - truth) < 4.0 * one.sigma
             assert one.size_N == pytest.approx(50.0 * one.amount, rel=0.1)
     assert not found.groups and not found.outliers
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_misfit_is_no_season_where_a_cause_acts_by_temperature(seed):
+    """The second cause is the first one times the temperature but for a tenth, and a fifth of a usual effect, alike in all
+    drives, looks like this tenth: large amounts of both would cancel each other and leave it. The third cause has a season."""
+    rng, fleet = np.random.default_rng(seed), {}
+    for number in range(14):
+        unit, drives = f"unit-{number}", []
+        level, warmth = 0.05 * rng.standard_normal(4), 15.0 + 6.0 * rng.standard_normal(12)
+        for day in range(12):
+            table, own = 50.0 * rng.standard_normal((200, 4)), 50.0 * rng.standard_normal(200)
+            change = (warmth[day] - 15.0) / 10.0
+            table[:, 1] = change * table[:, 0] + 0.1 * own
+            residual = table @ level + 0.2 * change * table[:, 2] + 0.2 * own + 20.0 * rng.standard_normal(200)
+            table = np.column_stack([table, residual])
+            drive = dataset.Drive(unit, "FL", "", day * 86_400_000_000_000, f"{day:016x}")
+            drives.append(scores.Score(drive, table.T @ table, 200, warmth[day]))
+        fleet[unit, "FL"] = drives
+    causes = [scores.Cause(f"effects.{name}", name, None, "1") for name in "abcd"]
+    [season] = findings.find(fleet, causes, "", {}, {}).seasons
+    assert season.cause == "c" and season.amount == pytest.approx(0.2, rel=0.15)
+
+
+def test_a_slope_is_of_what_changes_within_units_wherever_they_are():
+    """Units in the north and in the south, whose own temperature changes alike."""
+    rng = np.random.default_rng(0)
+    drives = [_scores(rng, f"unit-{number}", lambda drive: np.zeros(4), 12) for number in range(6)]
+    flat = population.Directions(np.eye(4) / np.sqrt(200.0) / 50.0, np.eye(4), np.ones(4))
+    warmth = [place + 0.3 * rng.standard_normal(12) for place in (-2.0, -2.0, 0.0, 0.0, 2.0, 2.0)]
+    assert population.changing(drives, flat, warmth).shape == (4, 4)
+
+
+def test_a_cause_that_is_mostly_a_level_of_others_has_no_slope():
+    prints = np.array([[1.0, 0.0], [1.0, 1.0], [0.1, 1.0]])
+    directions = population.Directions(np.eye(2), prints, np.ones(3))
+    np.testing.assert_array_equal(directions.prints_in(np.array([[1.0], [0.0]])), [[1.0], [1.0], [0.0]])
+    np.testing.assert_array_equal(directions.prints_in(np.eye(2)), prints)
 
 
 # -- end to end -------------------------------------------------------------------------------------------------------

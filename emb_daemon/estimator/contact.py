@@ -185,9 +185,9 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
     s.still_s = s.still_s + m.dt if released and m.angle == s.angle else 0.0
     torque = abs(s.plausibility.torque_mean)
     loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force
-    # After samples that came a cycle apart a longer gap is a lost frame, not a log at a reduced rate.
-    full_rate = m.dt <= ONE_CYCLE_S or s.since_start_s > 0.0
-    if not s.seen and s.since_start_s < _SEEN_S and full_rate:
+    # A gap may be lost frames, also the first: only a log none of whose samples come a cycle apart is at a reduced rate.
+    s.full_rate = s.full_rate or 0.0 < m.dt <= ONE_CYCLE_S
+    if not s.seen and s.since_start_s < _SEEN_S:
         # The torque must be averaged over some samples.
         s.since_start_s += m.dt
         s.unknown = not released
@@ -209,7 +209,7 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
     elif not s.seen:
         # At a request the brake may be clamped, which friction may hold without torque, or on its way. Frames at a reduced
         # rate tell nothing of it, and such logs begin with an open brake.
-        open_yet = m.has_status and m.park_brake == 0.0 and not full_rate
+        open_yet = m.has_status and m.park_brake == 0.0 and not s.full_rate
         s.unknown = not (loose and released) and not open_yet
     s.seen = True
 

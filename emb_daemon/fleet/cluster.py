@@ -22,6 +22,15 @@ _AHEAD = 20
 #: Time without an answer after which a scheduler counts as missing, s; and how often as long no worker may be there: starting
 #: one again takes some seconds.
 _PATIENCE_S, _WITHOUT_WORKERS = 10, 6
+#: Settings of Dask. A task takes seconds: scheduler and two workers that watch themselves up to a hundred times a second take
+#: a sixth of a core with nothing to do.
+_SETTINGS = {
+    "distributed.admin.large-graph-warning-threshold": "1GB",
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.worker.profile.enabled": False,
+}
 _AGAIN = "run the same command again, with --resume if it has that option"
 
 
@@ -44,9 +53,7 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
     import dask
     from distributed import Client, LocalCluster
 
-    with dask.config.set(
-        {"distributed.scheduler.allowed-failures": _LIVES, "distributed.admin.large-graph-warning-threshold": "1GB"}
-    ):
+    with dask.config.set(_SETTINGS | {"distributed.scheduler.allowed-failures": _LIVES}):
         if address:
             try:
                 client = Client(address, timeout=_PATIENCE_S)

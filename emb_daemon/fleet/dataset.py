@@ -180,9 +180,7 @@ def by_unit(found: list[Drive]) -> dict[tuple[str, str], list[Drive]]:
 def read_results(root: Path) -> list[dict[str, Any]]:
     """Result for each log file: ``source``, ``size``, ``mtime_ns``, ``sha256`` (of a damaged file: of its path), ``notes``,
     ``fault`` (empty if the file is good) and its ``drives``."""
-    # Data sets of earlier versions name a result after the content, with more digits; a later one of the same path counts.
-    paths = sorted(Path(root, "ingested").glob("*.json"), key=lambda path: (-len(path.name), path.name))
-    return list({known["source"]: known for known in (json.loads(path.read_bytes()) for path in paths)}.values())
+    return [json.loads(path.read_bytes()) for path in sorted(Path(root, "ingested").glob("*.json"))]
 
 
 def note(root: Path, known: dict[str, Any]) -> None:

@@ -18,8 +18,8 @@ from emb_daemon.fleet.population import (
     Outlier,
     Readings,
     Shared,
-    Unit,
     centres,
+    changing,
     outliers,
     random_effects,
     shared_causes,
@@ -217,7 +217,11 @@ class _Study:
             self.covariates.append("day")
         if slopes and np.isfinite(warmth).all() and np.ptp(warmth) >= _LEAST_K:
             self.covariates.append("warmth")
-        self.units = [self._unit(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
+        columns = [self._columns(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
+        #: By covariate, the directions in which units may differ.
+        self.free = [np.eye(self.directions.basis.shape[1])]
+        self.free += [changing(self.scores, self.directions, slope) for slope in zip(*(c.T[1:] for c in columns), strict=True)]
+        self.units = [unit_of(s, self.directions, c, self.free) for s, c in zip(self.scores, columns, strict=True)]
         named = sorted({name for levels in factors.values() for name in levels})
         # Corners differ by design: front and rear brakes are different.
         self.levels = {"corner": np.array([corner for _, corner in self.keys])}
@@ -231,32 +235,33 @@ class _Study:
         }  # fmt: skip
         self.masks = {ALL: np.ones(len(self.keys), bool), **self.groups}
 
-    def _unit(self, scores: Sequence[Score], days: np.ndarray) -> Unit:
+    def _columns(self, scores: Sequence[Score], days: np.ndarray) -> np.ndarray:
+        """Covariates of a unit's drives, shape (drives, m)."""
         columns = {
             "level": np.ones(len(scores)),
             "day": (days - 0.5 * self.span) / PER_DAYS,
             "warmth": (np.array([s.ambient_C for s in scores]) - self.warmth_C) / PER_K,
         }
-        return unit_of(scores, self.directions, np.column_stack([columns[name] for name in self.covariates]))
+        return np.column_stack([columns[name] for name in self.covariates])
 
     def read(self, covariate: str) -> tuple[np.ndarray, np.ndarray, Readings]:
         """The units' vectors, the same about their groups' centres, and readings of them."""
         row = self.covariates.index(covariate)
-        vectors = np.array([unit.values[row] for unit in self.units])
+        free = self.free[row]
+        vectors = np.array([unit.values[row] for unit in self.units]) @ free
         centre = centres(vectors, self.levels)
-        noise = np.array([unit.noise[row] for unit in self.units])
-        return vectors, vectors - centre, Readings(vectors, centre, self.directions.prints, noise)
+        noise = free.T @ np.array([unit.noise[row] for unit in self.units]) @ free
+        return vectors, vectors - centre, Readings(vectors, centre, self.directions.prints_in(free), noise)
 
     def findings(self, calibration: str, silent: dict[str, str], left_out: dict[str, str]) -> Findings:
-        prints = self.directions.prints
         level, apart, readings = self.read("level")
-        groups = shared_causes(level, self.groups, prints, readings, beside=True)
+        groups = shared_causes(level, self.groups, readings, beside=True)
         over: dict[str, list[Finding]] = {"day": [], "warmth": []}
         ageing: list[Finding] = []
         for name in self.covariates[1:]:
             slopes, uneven, own = self.read(name)
-            shared = shared_causes(slopes, {ALL: self.masks[ALL]}, prints, own, beside=False)
-            shared += shared_causes(slopes, self.groups, prints, own, beside=True)
+            shared = shared_causes(slopes, {ALL: self.masks[ALL]}, own, beside=False)
+            shared += shared_causes(slopes, self.groups, own, beside=True)
             over[name] = self._list_shared(shared, _ACTIONS[name])
             if name == "day":
                 ageing = self._outliers(uneven, own, _ACTIONS["ageing"])
@@ -268,7 +273,7 @@ class _Study:
             drives=len(self.every),
             silent=silent,
             left_out=left_out,
-            directions=prints.shape[1],
+            directions=len(self.free[0]),
             causes=len(self.causes),
             groups=self._list_shared(groups, _ACTIONS["level"]),
             drifts=over["day"],
@@ -347,7 +352,7 @@ class _Study:
                 ]
                 if len(window) < _LEAST_DRIVES:
                     continue
-                pooled = unit_of(window, self.directions, np.ones((len(window), 1)))
+                pooled = unit_of(window, self.directions, np.ones((len(window), 1)), self.free[:1])
                 days.append(float(0.5 * (low + high)))
                 sizes.append(float(reading @ pooled.values[0] * size))
                 sigmas.append(float(np.sqrt(reading @ pooled.noise[0] @ reading) * size))

@@ -19,6 +19,10 @@ from emb_daemon.fleet.scores import Score
 
 #: Directions whose information is below this share of the strongest one's are dominated by rounding and curvature.
 _TOLD_APART = 1e-5
+#: Share of a slope's information that free levels must leave: of what no cause explains, a slope then takes at most double.
+_SLOPE = 0.25
+#: Information, as a share of the drives', with which a direction is drawn to zero.
+_HELD = 0.01
 #: Share of units in the first estimate of the population's scatter, and number of passes after which it no longer changes.
 _CORE, _PASSES = 0.75, 20
 #: A unit whose distance is above this quantile of its chi-square is left out of the population's mean and scatter.
@@ -55,6 +59,13 @@ class Directions:
             size_N=scale / np.sqrt(samples),
         )
 
+    def prints_in(self, free: np.ndarray) -> np.ndarray:
+        """Prints by their coordinates in the span of ``free``, orthonormal columns of shape (q, r); zero for a cause most of
+        which is outside."""
+        inside = self.prints @ free
+        told = (inside**2).sum(axis=1) >= _SLOPE * (self.prints**2).sum(axis=1)
+        return inside * told[:, None]
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -69,20 +80,45 @@ class Unit:
     noise: np.ndarray
 
 
-def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndarray) -> Unit:
+def changing(units: Sequence[Sequence[Score]], directions: Directions, covariates: Sequence[np.ndarray]) -> np.ndarray:
+    """Directions, orthonormal columns of shape (q, r), whose change with a covariate is no level of other directions.
+
+    A torque constant that changes with the ambient temperature makes the force of a constant fade with temperature. Were both
+    free, they would cancel each other and explain with hundreds of newtons what is the misfit of a model.
+
+    Args:
+        covariates: of each unit's drives.
+    """
+    basis, left, square = directions.basis, 0.0, 0.0
+    for scores, covariate in zip(units, covariates, strict=True):
+        information = np.array([basis.T @ score.products[:-1, :-1] @ basis for score in scores])
+        own = covariate - covariate.mean()
+        level = information.sum(axis=0) + _HELD * len(scores) * np.eye(basis.shape[1])
+        both = np.einsum("d,dab->ab", own, information)
+        left = left + np.einsum("d,dab->ab", own**2, information) - both @ np.linalg.solve(level, both)
+        square += float(own @ own)
+    # Of an average drive the information is one in each direction.
+    share, vectors = np.linalg.eigh(left / square)
+    return vectors[:, share >= _SLOPE]
+
+
+def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndarray, free: Sequence[np.ndarray]) -> Unit:
     """One unit by least squares; ``covariates`` have shape (drives, m), the first of them 1.
 
-    Directions about which its drives say little are drawn to zero, with a hundredth of the information of an average drive.
-    The covariance counts drives: it is made of each drive's contribution to the equations at the solution (the sandwich of
-    White, Econometrica 48, 1980).
+    Of each covariate only the directions in ``free`` are not zero, see `changing`. Directions about which its drives say
+    little are drawn to zero, with a hundredth of the information of an average drive. The covariance counts drives: it is made
+    of each drive's contribution to the equations at the solution (the sandwich of White, Econometrica 48, 1980).
     """
+    from scipy.linalg import block_diag
+
     basis, (drives, count) = directions.basis, covariates.shape
     size = basis.shape[1]
     projected = np.array([basis.T @ score.products[:-1] for score in scores])
     information, right = projected[:, :, :-1] @ basis, projected[:, :, -1]
     normal = np.einsum("di,dj,dab->iajb", covariates, covariates, information).reshape(count * size, count * size)
-    held = 0.01 * np.maximum(np.diag(covariates.T @ covariates), 1e-12)
-    inverse = np.linalg.inv(normal + np.kron(np.diag(held), np.eye(size)))
+    held = _HELD * np.maximum(np.diag(covariates.T @ covariates), 1e-12)
+    span = block_diag(*free)
+    inverse = span @ np.linalg.inv(span.T @ (normal + np.kron(np.diag(held), np.eye(size))) @ span) @ span.T
     values = (inverse @ (covariates.T @ right).ravel()).reshape(count, size)
     left = right - np.einsum("dab,db->da", information, covariates @ values)
     moves = (np.einsum("di,da->dia", covariates, left).reshape(drives, -1) @ inverse.T).reshape(drives, count, size)
@@ -135,10 +171,11 @@ class Readings:
     Args:
         units: shape (N, q).
         centre: centre of each unit's groups, shape (N, q); scatter is about it.
-        prints: of the causes, shape (K, q).
+        prints: of the causes, shape (K, q); a cause whose print is zero is never found.
         noise: covariance of each unit by its own drives, shape (N, q, q).
 
     Attributes:
+        prints: as given.
         ordinary: units that are not outliers, shape (N,).
         filters: by unit and cause, weights that measure its vector, shape (N, K, q).
         inverse: of the scatter's covariance, mean over the parts, shape (q, q).
@@ -157,8 +194,9 @@ class Readings:
             np.einsum("ua,uab,ub->u", apart - means[fold], self._inverse[fold], apart - means[fold]), apart
         )
         along = np.einsum("fab,kb->fka", self._inverse, prints)
-        self.filters: np.ndarray = (along / np.einsum("fka,ka->fk", along, prints)[:, :, None])[fold]
-        self._prints, self._noise = prints, noise
+        self.filters: np.ndarray = (along / np.maximum(np.einsum("fka,ka->fk", along, prints), 1e-300)[:, :, None])[fold]
+        self.prints: np.ndarray = prints
+        self._noise = noise
         self.inverse: np.ndarray = self._inverse.mean(axis=0)
 
     def of(self, units: np.ndarray) -> np.ndarray:
@@ -171,8 +209,8 @@ class Readings:
 
     def gain(self, total: np.ndarray) -> np.ndarray:
         """Fall of the squared distance that each cause explains of a vector, shape (K,)."""
-        size = np.einsum("ka,ab,kb->k", self._prints, self.inverse, self._prints)
-        return (self._prints @ self.inverse @ total) ** 2 / size
+        size = np.einsum("ka,ab,kb->k", self.prints, self.inverse, self.prints)
+        return (self.prints @ self.inverse @ total) ** 2 / np.maximum(size, 1e-300)
 
 
 @dataclass(frozen=True)
@@ -206,16 +244,14 @@ _SECOND = 0.1
 LEAST_UNITS = 3
 
 
-def shared_causes(
-    units: np.ndarray, groups: Mapping[str, np.ndarray], prints: np.ndarray, readings: Readings, beside: bool
-) -> list[Shared]:
+def shared_causes(units: np.ndarray, groups: Mapping[str, np.ndarray], readings: Readings, beside: bool) -> list[Shared]:
     """Causes that groups of units share, one after the other, the strongest first, until none is significant.
 
     Args:
         groups: masks of the units, shape (N,).
         beside: compare groups with all other units; otherwise with zero.
     """
-    rows = readings.ordinary
+    rows, prints = readings.ordinary, readings.prints
     chosen: list[tuple[str, int]] = []
     found: list[Shared | None] = []
     first: dict[str, float] = {}

@@ -126,7 +126,7 @@ class Scorer:
         values = {self._contact: self._contact.start}
         for _ in range(_STEPS):
             residual, heat = bench.run(values)
-            column, *others = bench.regressors(values, [Probe(self._contact), *self._probes], residual, heat)
+            (column,) = bench.regressors(values, [Probe(self._contact)], residual, heat)
             if not (size := float(column @ column)):
                 raise InputError("the pads never touch")
             move = float(column @ residual[_CHANNEL]) / size
@@ -135,7 +135,7 @@ class Scorer:
             values[self._contact] += move
         else:
             raise InputError("the contact angle is not found; does the drive begin with the brake applied?")
-        table = np.column_stack([*others, residual[_CHANNEL]])
+        table = np.column_stack([*bench.regressors(values, self._probes, residual, heat), residual[_CHANNEL]])
         # The curve's coefficients together, each by its own size, are the scale of the force.
         curve = [row for row, cause in enumerate(self.causes) if cause.key.startswith("stiffness.curves")]
         loaded = np.abs(table[:, curve].sum(axis=1)) > LOADED_N

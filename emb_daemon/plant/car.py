@@ -1,5 +1,6 @@
 """The car: one to four brakes, longitudinal motion, training motion on request, and all its messages on the bus."""
 
+from functools import cache
 from math import cos, pi
 from typing import NamedTuple
 
@@ -63,7 +64,9 @@ class World(NamedTuple):
     ids: np.ndarray
 
 
+@cache
 def _reference_wires() -> np.ndarray:
+    """REFERENCE_WIRES of the shipped rig; read only."""
     database = wire.load_database(resource("dbc/rig.dbc"))
     wires = np.zeros(1, REFERENCE_WIRES)
     kinds = (
