@@ -108,12 +108,12 @@ def doubt_memory(s: Record, p: Record, rested_s: float) -> None:
 
 @njit
 def _follow_memory(s, p, static, travel, dt, drive):
-    """Standard deviation of the force by what the pads may remember: anything from what is believed, ``drive`` N, to what they
-    would if they had been held."""
+    """Standard deviation of the force by what the pads may remember: as likely as not what is believed, ``drive`` N, else
+    anything from there to what they would if they had been held."""
     for port in range(len(s.effects.terms.added)):
         s.held_effects.terms.added[port] = s.effects.terms.added[port]
     held = effects.static_force(p.effects, s.held_effects, static, travel, dt)
-    sigma = abs(held - drive) / sqrt(3.0)
+    sigma = abs(held - drive) * sqrt(0.5 / 3.0)
     s.memory_sigma = sigma if sigma > _FORGOTTEN * p.stiffness_sigma else 0.0
 
 

@@ -296,8 +296,8 @@ class ReferenceBus(PythonCanBus):
 
 
 def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
-    """python-can's bus by its options (`cli.busoptions`), or as many as the mapping names channels; for CAN FD if the rig's
-    messages are.
+    """python-can's bus by its options (`cli.options.bus_options`), or as many as the mapping names channels; for CAN FD if the
+    rig's messages are.
 
     Raises:
         InputError: no interface is named, or an unknown one, or the mapping has no DBC.

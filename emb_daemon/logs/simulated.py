@@ -92,5 +92,5 @@ class SimulatedRig(PythonCanBus):
 
 
 def open_simulated(options: dict[str, Any], mapping: Mapping, ids: list[int]) -> SimulatedRig:
-    """A bus by python-can's options (`cli.busoptions`); errors as in `logs.live.open_buses`."""
+    """A bus by python-can's options (`cli.options.bus_options`); errors as in `logs.live.open_buses`."""
     return SimulatedRig(open_buses(options, mapping), mapping, ids)
