@@ -21,6 +21,7 @@ from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import revise
 from emb_daemon.diagnose.text import verdict
+from emb_daemon.effects import REGISTRY
 from emb_daemon.offline import log_of
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
@@ -92,6 +93,22 @@ def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):
     assert named.accepted == ["viscous_friction"]
     assert named.candidates["viscous_friction"].q_value == made.candidates[term].q_value
     assert named.candidates[term].reason == "an effect of the catalogue says the same"
+
+
+def test_what_friction_does_as_it_turns_over_proves_no_effect(viscous, monkeypatch):
+    """How it does is a guess of every model: what an effect gains counts where the motor slides."""
+    selection, _, _ = viscous
+    model = selection.without("viscous_friction", "to ask it again").model
+    [viscous_friction] = [effect for effect in REGISTRY if effect.name == "viscous_friction"]
+
+    def reason():
+        [candidate] = selection.screening.test(model, [viscous_friction])
+        return selection.screening.plausible(model, candidate, {}).reason
+
+    assert reason() == ""
+    [trial] = model.bench.trials
+    monkeypatch.setattr(trial, "slides", np.zeros_like(trial.slides))
+    assert reason().startswith("explains 0 N RMS where friction slides, too little to matter")
 
 
 def test_what_makes_the_running_estimator_worse_is_taken_out_again(judged, monkeypatch):

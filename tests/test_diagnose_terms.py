@@ -575,6 +575,19 @@ def test_a_term_beside_which_everything_else_says_the_same_is_not_applied(couple
     assert revise(coupled[0]).accepted == []
 
 
+@pytest.mark.parametrize(("deviations", "stays"), [(1.9, False), (2.1, True)])
+def test_a_term_on_which_episodes_do_not_agree_is_not_applied(coupled, monkeypatch, deviations, stays):
+    """One hot stop may carry the best of the whole grammar, which is as good as nothing in all others."""
+    evidence_against = Model.evidence_against
+
+    def scattered(self, values, samples=1):
+        found = evidence_against(self, values, samples)
+        return dataclasses.replace(found, sigmas=np.abs(found.values) / deviations)
+
+    monkeypatch.setattr(Model, "evidence_against", scattered)
+    assert bool(revise(coupled[0]).accepted) is stays
+
+
 def test_a_term_that_does_not_carry_over_is_not_written(calibration, coupled, monkeypatch):
     selection, fit_log, _ = coupled
     nominal = log_of(next(drives(calibration, 54, {}, stops=3)))

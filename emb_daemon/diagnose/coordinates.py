@@ -150,7 +150,7 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
         # The mounted pads' curve stands for all: pads of other thickness are off by the same share.
         keys.sort(key=lambda key: not key.startswith(f"stiffness.curves[{mounted}]"))
         if any(value_of(calibration, key) for key in keys):
-            result.append(_scale(calibration, keys, "stiffness", _CURVE))
+            result.append(scaled_coordinate(calibration, keys, "stiffness", _CURVE))
     for name in ("per_K", "history_per_K"):
         known = parameter(calibration, f"thermal.softening.{name}")
         # Of what no log has shown yet only the usual size is known.
@@ -160,9 +160,9 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
         result.append(Coordinate(known.key, "stiffness", known.value, known.step, prior, move, low, high, known.unit))
     if not calibration.thermal.softening.history_per_K:
         # No log has shown it yet.
-        result.append(_scale(calibration, [HISTORY_TIME], "stiffness", 1.0))
+        result.append(scaled_coordinate(calibration, [HISTORY_TIME], "stiffness", 1.0))
     for key, channel, prior in _BASE:
-        coordinate = _scale(calibration, [key], channel, _STATED if stated and key == TORQUE_CONSTANT else prior)
+        coordinate = scaled_coordinate(calibration, [key], channel, _STATED if stated and key == TORQUE_CONSTANT else prior)
         if key in _LEAST_OF_ANY and not calibration.contact.is_in_reach:
             known = max(_GUESSED * coordinate.start, coordinate.prior)
             coordinate = replace(coordinate, prior=known, low=_LEAST_OF_ANY[key] * coordinate.start)
@@ -170,8 +170,8 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
     return result + _friction(calibration)
 
 
-def _scale(calibration: Calibration, keys: list[str], channel: str, prior: float) -> Coordinate:
-    """Keys in proportion, as multiples of their size; the first gives the name."""
+def scaled_coordinate(calibration: Calibration, keys: list[str], channel: str, prior: float) -> Coordinate:
+    """Keys in proportion, as multiples of their size, known to a share ``prior`` of it; the first gives the name."""
     known = [parameter(calibration, key) for key in keys]
     first = known[0]
     # A step is a thousandth of the size: of the value, or of the usual size where the value is next to nothing.
@@ -181,11 +181,6 @@ def _scale(calibration: Calibration, keys: list[str], channel: str, prior: float
     least = _LEAST * start if first.low > 0.0 else first.low / sizes[0]
     known_to = prior * abs(start) if abs(start) > _NEXT_TO_NOTHING else prior * _OF_USUAL
     return Coordinate(first.key, channel, start, first.step / sizes[0], known_to, moves, least, first.high / sizes[0])
-
-
-def scaled_coordinate(calibration: Calibration, key: str, channel: str, prior: float) -> Coordinate:
-    """Coordinate of one key of the base calibration, known to a share ``prior`` of its size."""
-    return _scale(calibration, [key], channel, prior)
 
 
 def _usual(step: float) -> float:

@@ -208,12 +208,9 @@ def _description(selection: Selection, channel: str) -> float:
     matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
     numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
     numbers += sum(further_numbers(term) for term in model.bench.calibration.terms if term.name in _made(selection, channel))
-    named = len(_causes(selection, channel)) * np.log(places(port for port in PORTS if _acts_on(model, port, channel)))
+    ports = [port for port in PORTS if model.bench.channel_of(HOOKS[port].channel) == channel]
+    named = len(_causes(selection, channel)) * np.log(places(ports))
     return description_length(max(left, matters), numbers, model.bench.episodes) + named
-
-
-def _acts_on(model: Model, port: str, channel: str) -> bool:
-    return model.bench.channel_of(HOOKS[port].channel) == channel
 
 
 def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:

@@ -37,7 +37,7 @@ AS_GOOD, _NEARLY = 0.95, 0.9
 #: Chipman, Canadian J. Statistics 24, 1996).
 _LEADING = 10
 #: Shifts of all signals in time, and of the chosen one's.
-_CHANCES, _SHIFTS = 99, 5
+CHANCES, SHIFTS = 99, 5
 #: Share of the samples in which a term must stay within what its port may bear.
 _HELD = 0.9
 #: Sum of squares up to which it is nothing, as that of a regressor that decays: a quotient by less would overflow.
@@ -235,26 +235,42 @@ class Search:
 
     @cached_property
     def _chance(self) -> float:
-        return self.chance_of(self.forms, self.gains, _CHANCES)
+        return self.chance_of(self.forms, self.gains)
 
     @cached_property
     def _chance_of_two(self) -> float:
-        return self.chance_of([*self.forms, *self.products], np.append(self.gains, self.product_gains), _CHANCES)
+        return self.chance_of([*self.forms, *self.products], np.append(self.gains, self.product_gains))
 
-    def chance_of(self, forms: Sequence[Form], gains: np.ndarray, chances: int) -> float:
-        """Chance that the best of some forms gains as much with their signals moved in time, by so many trials."""
-        return _chance(self, forms, gains, chances)
+    def chance_of(self, forms: Sequence[Form], gains: np.ndarray) -> float:
+        """Chance that the best of some forms gains as much with their signals moved in time."""
+        screen = Screen(self.model, self.channel, COARSE)
+        shapes = list(dict.fromkeys(replace(form, port="") for form in forms))
+        row = {shape: index for index, shape in enumerate(shapes)}
+        every = [screen.means.of(_values(self.model.bench, shape, self.signals)[:, None]) for shape in shapes]
+        values = np.column_stack(every) * screen.means.per_mean[:, None]
+        by_port = []
+        for port, column in self.sensitivities.items():
+            rows = [row[replace(form, port="")] for form in forms if form.port == port]
+            if rows:
+                by_port.append((screen.means.of((column * screen.keep)[:, None]), values[:, rows]))
+        gain = gains.max()
+        for number in range(CHANCES):
+            shift = int(len(values) * self.random.uniform(0.1, 0.9))
+            if any(float(screen.scores_of(does * np.roll(own, shift, axis=0)).gain.max()) >= gain for does, own in by_port):
+                # One that is as good is one too many, and settles it.
+                return 2.0 / (2.0 + number)
+        return 1.0 / (1.0 + CHANCES)
 
     def at_another_time(self, form: Form) -> float:
         """Gain of a term with its signal moved in time, as if the log were a circle, the median of a few; none for a ripple.
 
         Not by the largest: what rises once and stays is, moved by a little, still much of itself."""
-        return 0.0 if form.shape == "harmonic" else float(np.median(self.gains_moved(form, _SHIFTS)))
+        return 0.0 if form.shape == "harmonic" else float(np.median(self.gains_moved(form)))
 
-    def gains_moved(self, form: Form, shifts: int) -> np.ndarray:
-        """The same of a form that is no ripple, for so many shifts."""
+    def gains_moved(self, form: Form) -> np.ndarray:
+        """The same of a form that is no ripple, for each of the shifts."""
         values = _values(self.model.bench, form, self.signals)
-        by = [int(len(values) * self.random.uniform(0.25, 0.75)) for _ in range(shifts)]
+        by = [int(len(values) * self.random.uniform(0.25, 0.75)) for _ in range(SHIFTS)]
         columns = np.column_stack([self.sensitivities[form.port] * np.roll(values, shift) for shift in by])
         return self.screen.scores(columns).gain
 
@@ -347,26 +363,6 @@ def _unheld(term: Term) -> np.void:
     fill_terms(parameters, (term,))
     parameters["term"][0]["limit"] = parameters["term"][0]["growth"] = np.inf
     return parameters["term"][0]
-
-
-def _chance(search: Search, forms: Sequence[Form], gains: np.ndarray, chances: int) -> float:
-    screen = Screen(search.model, search.channel, COARSE)
-    shapes = list(dict.fromkeys(replace(form, port="") for form in forms))
-    row = {shape: index for index, shape in enumerate(shapes)}
-    every = [screen.means.of(_values(search.model.bench, shape, search.signals)[:, None]) for shape in shapes]
-    values = np.column_stack(every) * screen.means.per_mean[:, None]
-    by_port = []
-    for port, column in search.sensitivities.items():
-        rows = [row[replace(form, port="")] for form in forms if form.port == port]
-        if rows:
-            by_port.append((screen.means.of((column * screen.keep)[:, None]), values[:, rows]))
-    gain = gains.max()
-    for number in range(chances):
-        shift = int(len(values) * search.random.uniform(0.1, 0.9))
-        if any(float(screen.scores_of(does * np.roll(own, shift, axis=0)).gain.max()) >= gain for does, own in by_port):
-            # One that is as good is one too many, and settles it.
-            return 2.0 / (2.0 + number)
-    return 1.0 / (1.0 + chances)
 
 
 def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:

@@ -233,9 +233,12 @@ class Bench:
         How it does is a guess of every model, and with the motor held just behind a reversal it lasts as long as the hold: on
         two simulated brakes with nothing hidden it alone explained 23 and 24 N of what lasts, where 8 and 11 N are left
         without these samples. Of what clamps nothing the presliding angle is a guess itself."""
-        of_torque = channel in ("torque", "innovation") and self.clamps
-        told = np.concatenate([trial.slides for trial in self.trials]) if of_torque else None
+        told = np.concatenate([trial.slides for trial in self.trials]) if self.shows_turning(channel) else None
         return Averaging(self.episode[channel], samples, told)
+
+    def shows_turning(self, channel: str) -> bool:
+        """Whether a channel's residual shows how friction turns over, which every model of a brake guesses."""
+        return channel in ("torque", "innovation") and self.clamps
 
     @property
     def sources(self) -> list[str]:

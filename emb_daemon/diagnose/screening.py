@@ -37,6 +37,9 @@ _RESIDUAL_SHARE, _SIGNAL_SHARE = 0.06, 0.002
 #: A term is held against what lasts of the residual, and matters from this share of that where it is less: on four drives of
 #: simulated brakes with nothing hidden the best of all forms gains 0.07 to 0.12 of it.
 _LASTING_SHARE = 0.2
+#: Samples in the shortest means, which leave out where friction turns over. How it does is a guess of every model: where it
+#: turns over late it looks like a friction that rises with speed.
+_SLIDING = 2
 #: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
 _FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
 #: The same of a term (K), held against all that heat capacities and conductances can do in these logs, which may take four
@@ -226,8 +229,12 @@ class Screening:
         floor = self.floor(model, channel)
         if evidence.gain <= 0.0:
             return replace(candidate, reason="no gain on left-out episodes")
-        if candidate.gain < floor:
-            too_little = f"explains {candidate.gain:.3g} {unit} RMS, too little to matter (limit {floor:.3g} {unit})"
+        gain, where = candidate.gain, ""
+        if model.bench.shows_turning(channel):
+            sliding = model.rms(model.evidence(channel, candidate.columns, samples=_SLIDING).gain, channel)
+            gain, where = min((gain, where), (sliding, " where friction slides"))
+        if gain < floor:
+            too_little = f"explains {gain:.3g} {unit} RMS{where}, too little to matter (limit {floor:.3g} {unit})"
             return replace(candidate, reason=too_little)
         for c, value, sigma in zip(candidate.amplitudes, evidence.values, evidence.sigmas, strict=True):
             if not c.low - 2.0 * sigma <= value <= c.high + 2.0 * sigma:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle
+from emb_daemon.diagnose.evidence import Evidence
 from emb_daemon.diagnose.model import LASTING, Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
@@ -327,22 +328,29 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
         samples = LASTING[candidate.channel] if over_grammar else 1
         evidence = model.evidence_against(dict.fromkeys(group, 0.0), samples)
         gain, chance = model.rms(evidence.gain, candidate.channel), evidence.p_value
+        unclear = over_grammar and _is_unclear(evidence)
         if whole and (0.0 < gain < floor if over_grammar else min(gain, Q_VALUE - chance) <= 0.0):
             # From where a far fit ended a line does not lead back: what it gains, a fit without it says.
-            without = model.without(model.of_effect(name)).refined({candidate.channel})
+            unclear, without = False, model.without(model.of_effect(name)).refined({candidate.channel})
             fall = np.subtract(*(m.left_out(candidate.channel, samples=samples) for m in (without, model)))
             gain, chance = (
                 model.rms(fall.sum(), candidate.channel),
                 float(ttest_1samp(fall, 0.0, alternative="greater").pvalue),
             )
         little = gain < floor
-        # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter; and so must
-        # what is gained where a prior alone says how large it is.
-        by_chance = chance > Q_VALUE and not over_grammar
+        # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter, and they must
+        # agree; and so must what is gained where a prior alone says how large it is.
+        by_chance = unclear if over_grammar else chance > Q_VALUE
         if gain <= 0.0 or by_chance or (little and (over_grammar or not _is_carried(model, group))):
             gone += group
             gains.append(gain / floor)
     return (max(gains), name, gone) if gone else None
+
+
+def _is_unclear(evidence: Evidence) -> bool:
+    """Whether amplitudes are not clear of nothing by how episodes scatter: a term that one hot episode carries may be the best
+    of the whole grammar, and be as good as nothing in the others."""
+    return bool(np.square(evidence.values / evidence.sigmas).sum() < _CARRIED**2 * len(evidence.values))
 
 
 def _is_carried(model: Model, group: Sequence[Coordinate]) -> bool:

@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import Coordinate, Values, base_coordinates, scaled_coordinate
 from emb_daemon.diagnose.forms import FORMED, Form
 from emb_daemon.diagnose.model import Model
-from emb_daemon.diagnose.prospects import Scores, Screen, Search, covered_by, record_of
+from emb_daemon.diagnose.prospects import CHANCES, SHIFTS, Scores, Screen, Search, covered_by, record_of
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench
 from emb_daemon.diagnose.screening import Rivals, Screening
 from emb_daemon.effects.base import HOOKS
@@ -96,7 +96,7 @@ class HeatBench(Bench):
     def model(self) -> Model:
         """The calibration's heat balance, fitted to the recordings."""
         base = [c for c in base_coordinates(self.calibration, []) if c.channel == CHANNEL_OF_HEAT]
-        further = [scaled_coordinate(self.calibration, key, CHANNEL_OF_HEAT, prior) for key, prior in _FURTHER]
+        further = [scaled_coordinate(self.calibration, [key], CHANNEL_OF_HEAT, prior) for key, prior in _FURTHER]
         start: dict[Coordinate, float] = {c: c.start for c in (*base, *further)}
         return Model(self, start, *self.run(start), centre=start).refined([CHANNEL_OF_HEAT])
 
@@ -150,16 +150,16 @@ class HeatSearch(Search):
         rows = len(columns) // _PLACES
         return np.roll(columns, _PLACES * int(rows * self.random.uniform(low, high)), axis=0)
 
-    def chance_of(self, forms: Sequence[Form], gains: np.ndarray, chances: int) -> float:
+    def chance_of(self, forms: Sequence[Form], gains: np.ndarray) -> float:
         columns, most = self._answers_of(forms), gains.max()
-        for number in range(chances):
+        for number in range(CHANCES):
             if float(self.screen.scores(self._move_in_time(columns, 0.1, 0.9)).gain.max()) >= most:
                 return 2.0 / (2.0 + number)
-        return 1.0 / (1.0 + chances)
+        return 1.0 / (1.0 + CHANCES)
 
-    def gains_moved(self, form: Form, shifts: int) -> np.ndarray:
+    def gains_moved(self, form: Form) -> np.ndarray:
         column = self.answer(form)[:, None]
-        return np.array([self.screen.scores(self._move_in_time(column, 0.25, 0.75)).gain[0] for _ in range(shifts)])
+        return np.array([self.screen.scores(self._move_in_time(column, 0.25, 0.75)).gain[0] for _ in range(SHIFTS)])
 
     def is_within(self, term: Term) -> bool:
         return True
