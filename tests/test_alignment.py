@@ -143,8 +143,8 @@ def test_after_one_filter_was_undone_the_next_is_found_as_soon_as_a_first_one():
     for shown, needed in zip(*_apart(_torque(seed=4), -4.0), strict=True):
         for one in (a, fresh):
             compare(one, shown, needed, 0.0, _NOISE)
-        assert (a["late"], a["slow"]) == (fresh["late"], fresh["slow"])
-        found += fresh["slow"] < 0.0
+        assert (a["delay_left"], a["lag_left"]) == (fresh["delay_left"], fresh["lag_left"])
+        found += fresh["lag_left"] < 0.0
     assert found > 100
 
 

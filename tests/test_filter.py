@@ -78,7 +78,7 @@ def test_covariance_stays_symmetric_and_positive_over_long_random_input(paramete
     add_stiffness_jumps(P, p)
     add_torque_jumps(P, p)
     for number in range(20_000):
-        set_walks(walked, p, x, P, *rng.uniform(0.0, 1.0, 2), rng.uniform(0.0, 0.2), rng.uniform(0.0, 1e5), 0.004)
+        set_walks(walked, p, x, P, *rng.uniform(0.0, 1.0, 2), rng.uniform(0.0, 0.2), rng.uniform(0.0, 1e5), 0.0, 0.004)
         predict_errors(x, P, rng.uniform(0.9, 1.0), rng.uniform(0.3, 1.0), 3e-4, walked)
         force = rng.uniform(0.0, 3e4)
         heats = rng.uniform(0.0, 1.0, 2)
@@ -124,7 +124,7 @@ def test_filter_is_consistent_on_data_of_its_own_model(parameters):
                 (step / 1e3, step / 4e3),
             )
             to_f, h = _sensitivities(p, *arguments)
-            set_walks(walked, p, np.zeros(STATES), P, step / 1e3, step / 4e3, 0.0, 2e4, 0.004)
+            set_walks(walked, p, np.zeros(STATES), P, step / 1e3, step / 4e3, 0.0, 2e4, 0.0, 0.004)
             truth[FAST], truth[NOISE] = decay * truth[FAST], noise_decay * truth[NOISE]
             drive = walked.copy()
             drive[FAST], drive[NOISE] = 1.0 - decay**2, (1.0 - noise_decay**2) * noise
@@ -183,7 +183,7 @@ def test_an_error_of_each_kind_is_found_from_strokes(parameters, name):
         motor = (p["gear_gain"] + p["load_friction"] * friction) * force + inertia + p["offset_friction"] * friction
         slope = (0.15 * force + 250.0) * (force > 0.0)
         _, h = _sensitivities(p, force, slope, speed, inertia, motor, friction, 0.0, (0.0, 0.0))
-        set_walks(walked, p, x, P, 0.0, 0.0, 0.0, 0.0, 0.004)
+        set_walks(walked, p, x, P, 0.0, 0.0, 0.0, 0.0, 0.0, 0.004)
         predict_errors(x, P, decay, noise_decay, variance, walked)
         innovation = h @ truth + rng.normal() * np.sqrt(variance) - h @ x
         _update(x, P, gain, innovation, h, variance)
@@ -240,7 +240,7 @@ def test_the_torque_constant_walks_with_the_fade_that_driving_found(parameters, 
     def walk(fade, sigma, heat):
         x, P = np.zeros(STATES), np.zeros((STATES, STATES))
         x[FADE], P[FADE, FADE] = fade, sigma**2
-        set_walks(walked, p, x, P, heat, 0.0, 0.0, 0.0, 10.0)
+        set_walks(walked, p, x, P, heat, 0.0, 0.0, 0.0, 0.0, 10.0)
         return np.sqrt(walked[GAIN])
 
     cold = walk(found, open_yet, 0.0)

@@ -211,7 +211,7 @@ def test_simulate_and_monitor_take_a_mapping(tmp_path, capsys):
     now = time.monotonic_ns()
     state = listener.corners[0].state(now)
     assert state["clamp_force_kN"] == 5.0 and abs(state["clamp_force_ref_kN"]) < 0.2
-    assert "(sensor " in summary(listener, now)[0]
+    assert "(reference " in summary(listener, now)[0]
     assert listener.corners[0].state(now + 1_000_000_000)["clamp_force_ref_kN"] is None
     for left in (broadcast, listening):
         left.shutdown()

@@ -95,10 +95,10 @@ def _deform(s, p, x, dt, factor):
 
 
 @njit
-def doubt_memory(s: Record, p: Record, rested_s: float) -> None:
-    """What the pads remember is unknown: an ordinary stop may have ended ``rested_s`` s ago, or none. With effects of slow
-    relaxation that is force which neither angle nor torque of a released brake shows."""
-    held = _ORDINARY * p.maximum_force
+def doubt_memory(s: Record, p: Record, chance: float, rested_s: float) -> None:
+    """What the pads remember is unknown: with that ``chance`` a stop, as strong as an ordinary one or less, ended ``rested_s``
+    s ago. With effects of slow relaxation that is force which neither angle nor torque of a released brake shows."""
+    held = sqrt(chance) * _ORDINARY * p.maximum_force
     travel = travel_at(held, p.curve)
     if np.isfinite(travel):
         effects.static_force(p.effects, s.held_effects, held, travel, _LONG_S)
@@ -108,12 +108,12 @@ def doubt_memory(s: Record, p: Record, rested_s: float) -> None:
 
 @njit
 def _follow_memory(s, p, static, travel, dt, drive):
-    """Standard deviation of the force by what the pads may remember: as likely as not what is believed, ``drive`` N, else
-    anything from there to what they would if they had been held."""
+    """Standard deviation of the force by what the pads may remember: anything from what is believed, ``drive`` N, to what they
+    would if they had been held."""
     for port in range(len(s.effects.terms.added)):
         s.held_effects.terms.added[port] = s.effects.terms.added[port]
     held = effects.static_force(p.effects, s.held_effects, static, travel, dt)
-    sigma = abs(held - drive) * sqrt(0.5 / 3.0)
+    sigma = abs(held - drive) / sqrt(3.0)
     s.memory_sigma = sigma if sigma > _FORGOTTEN * p.stiffness_sigma else 0.0
 
 
