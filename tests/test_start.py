@@ -4,6 +4,8 @@ import brake
 import numpy as np
 import pytest
 
+from emb_daemon.estimator import restart
+from emb_daemon.estimator.records import new_state
 from emb_daemon.models.stiffness import travel_at
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
@@ -245,3 +247,18 @@ def test_what_pads_may_remember_of_a_stop_before_the_start_is_covered_until_they
     assert error[early].min() > 5.0 * p["stiffness_sigma"]
     assert _covered(estimates, force)
     assert np.all(estimates["sigma"][late] < 1.1 * p["stiffness_sigma"]) and error[late].max() < p["stiffness_sigma"]
+
+
+def test_after_a_restart_the_time_since_the_snapshot_tells_what_pads_may_remember(p):
+    """A daemon that ran ten seconds ago may have stopped just after a stop; one that ran a quarter of an hour ago has not."""
+    p["effects"]["second_relaxation"]["share"], p["effects"]["second_relaxation"]["time_constant_s"] = 0.1, 3.0
+    rows, _ = brake.samples(p, brake.stops(p, 2), creep=(0.1, 3.0))
+    state, snapshot = new_state(), np.zeros(1, restart.SNAPSHOT)[0]
+    estimate(rows, p, state)
+    assert restart.take_snapshot(state[0], p, snapshot)
+    rested, sigmas = _standing(p)[0], {}
+    for elapsed_s in (10.0, 900.0):
+        restarted = new_state()
+        restart.resume(restarted[0], p, snapshot, elapsed_s)
+        sigmas[elapsed_s] = estimate(rested, p, restarted)["sigma"][1]
+    assert sigmas[10.0] > 1.3 * estimate(rested, p)["sigma"][1] and sigmas[900.0] < 1.1 * p["stiffness_sigma"]
