@@ -197,6 +197,7 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
         s.unknown = False
     elif s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
         place_contact(s, p, m.angle)
+        # It was clamped until now, perhaps.
         doubt_memory(s, p, 1.0, 0.0)
         s.unknown, s.start_angle = False, m.angle
         if not loose:

@@ -29,7 +29,11 @@ _CREEP_S = (1.0, 8.0)
 _LONG_S = 1e6
 #: Share of the largest force that ordinary stops reach: a third of the deceleration that tyres allow.
 _ORDINARY = 0.3
-#: Share of the stiffness path's noise below which what pads may remember counts no more.
+#: Chance that such a stop has just ended at a start of which no snapshot tells, and at one of a daemon that ran just before.
+#: Guesses: most of the former are of parked cars, and the first is the most that leaves the start of the shipped calibration,
+#: whose pads relax by a tenth, below the 300 N that are reported.
+AT_A_START, AFTER_A_RESTART = 0.25, 0.5
+#: Share of the stiffness path's noise below which what pads may remember counts no more: it adds half a per cent to sigma.
 _FORGOTTEN = 0.1
 #: Standard deviation of the contact angle, rad, from which the curve's slope is taken as a mean over it.
 UNCERTAIN_CONTACT_RAD = 0.05

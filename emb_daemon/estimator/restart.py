@@ -8,7 +8,7 @@ from math import exp
 
 import numpy as np
 
-from emb_daemon.estimator.paths import doubt_memory
+from emb_daemon.estimator.paths import AFTER_A_RESTART, doubt_memory
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
@@ -34,8 +34,6 @@ from emb_daemon.wire.contract import CYCLE_S
 _UNSEEN_K_PER_S, _UNSEEN_K = 5.0, 200.0
 #: Time between two snapshots of a daemon that runs, s: the most that a restart loses.
 SNAPSHOT_S = 10.0
-#: Chance that a stop has just ended when a daemon that was running starts again.
-_AFTER_A_STOP = 0.5
 #: Longest step when the heat flow meanwhile is simulated, s, and longest time that is simulated, s.
 _STEP_S, _FOLLOWED_S = 5.0, 6 * 3600.0
 
@@ -158,7 +156,7 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     s.covariance[FAST, FAST] = 1.0
     s.covariance[NOISE, NOISE] = sq(p.torque_constant * p.current_sigma)
     add_rest(s.covariance, p, elapsed_s)
-    doubt_memory(s, p, _AFTER_A_STOP, max(elapsed_s - SNAPSHOT_S, 0.0))
+    doubt_memory(s, p, AFTER_A_RESTART, max(elapsed_s - SNAPSHOT_S, 0.0))
     s.alignment.delay, s.alignment.lag, s.lateness.filtered = snapshot.delay, snapshot.lag, snapshot.filtered
     s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
     s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)

@@ -16,7 +16,7 @@ from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
-from emb_daemon.estimator.paths import ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
+from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
@@ -62,8 +62,6 @@ SILENCE_S = 0.1
 _LED = 0.2
 #: Samples in which a motor that stands must have done so, and time over which its speed's noise is averaged, s.
 _HELD, _NOISE_S = 25, 0.5
-#: Chance that a stop has just ended at a start of which no snapshot tells: most are of parked cars.
-_AFTER_A_STOP = 0.25
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
 #: Factor on the calibration's largest force above which no clamp force is possible.
@@ -88,7 +86,7 @@ def _start(s, p, m):
             for i in CREEPS:
                 s.covariance[i, i] = 0.0
         else:
-            doubt_memory(s, p, _AFTER_A_STOP, 0.0)
+            doubt_memory(s, p, AT_A_START, 0.0)
     s.gear_zero = m.angle
     # A motor that turns already comes from where nobody knows.
     s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf
