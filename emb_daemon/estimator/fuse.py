@@ -231,8 +231,6 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     # contain no more information than one. So is an error that no model explains, for some stops.
     white += (sq(friction_torque * s.friction_variance) + doubted * doubted) / (DISSOLVING_PER_S * m.dt)
     white += lasting * lasting * _LASTS_S / m.dt
-    # What the pads may remember is no error of the torque, but would be learned as one of the contact angle.
-    white += sq(leverage * s.memory_sigma)
     slow_friction, accelerating, needed = needed_torque(s, p, m, mean_force, leverage)
     to_force(h, s, spread, s.slope, s.force, warmth)
     slope = s.gear_slope
