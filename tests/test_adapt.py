@@ -613,6 +613,18 @@ def test_a_wrong_torque_constant_is_not_taken_for_other_pads(ideal, gain):
     assert abs(force_error(other, ideal, [20.0])[0]) < 3.0 * sigma_at(other, ideal, 20.0)
 
 
+def test_a_motor_that_heats_itself_in_a_training_is_taken_for_nothing_else(ideal):
+    """Its torque falls by a fifth meanwhile, as driving has shown, which neither a torque constant nor an inertia explains."""
+    rows = trained_rows(ideal)
+    rows["faded"] = np.linspace(-0.1, -0.3, len(rows))
+    rows["current_q"] /= 1.0 + rows["faded"]
+    found = fit(rows, IDEAL)
+    assert found.outcome == r.ACCEPTED and not found.evidence["curve_changed"], found.note
+    assert found.evidence["torque_gain"] == pytest.approx(1.0, abs=0.02)
+    assert abs(found.contact_angle - ideal["clearance"]) < 3.0 * found.contact_sigma
+    assert found.inertia_error == pytest.approx(0.0, abs=0.05)
+
+
 @pytest.mark.parametrize(("curve", "inertia"), [(0.88, 1.06), (1.0, 1.15), (1.1, 0.9)])
 def test_the_inertia_of_another_unit_is_not_taken_for_a_torque_constant(ideal, curve, inertia):
     """With pads that are known the inertia is found; with others, which of both it is stays in sigma."""

@@ -430,7 +430,7 @@ def test_what_a_training_collects_is_what_the_path_models_read(parked):
     """The current of a gap, which is of its last cycle alone, excepted; with what pads remembered when it began."""
     a, m, _, limits = parked
     a["still_time"], limits["high_force"], limits["longest_training"] = 0.0, 1e9, 1e9
-    shared = [name for name in r.TRAINING.names if name != "factor"]
+    shared = [name for name in r.TRAINING.names if name not in ("factor", "faded")]
     for number, name in enumerate(shared):
         m[name] = True if name.startswith("has_") else 2.0 + number
     remembered = np.zeros(1, r.REMEMBERED)
@@ -439,6 +439,18 @@ def test_what_a_training_collects_is_what_the_path_models_read(parked):
     advance(parked, rows, 0.1, remembered, 4.0)
     assert remembered["second_relaxation"]["force"] == 3.0
     assert not rows[1]["has_current"] and rows[1]["angle"] == m["angle"] and a["rows"] == 2
+
+
+@pytest.mark.parametrize("stops", [0.0, 1.0])
+def test_a_training_knows_how_the_motor_fades_by_what_was_known_before_it(parked, stops):
+    """By what stops have shown, not by what it makes the filter believe itself; at the heat of each sample."""
+    a, m, _, _ = parked
+    a["rows"], s, rows = 0, new_state()[0], np.zeros(2, r.TRAINING)
+    s["stops"] = stops
+    for fade, housing_fade, winding in ((-0.5, -0.2, 0.1), (0.3, 0.1, 0.3)):
+        s["error"][[FADE, HOUSING]], s["winding"], s["housing"] = (fade, housing_fade), winding, 0.2
+        training._collect(a, s, np.zeros(1, r.REMEMBERED), rows, m)
+    np.testing.assert_allclose(rows["faded"], stops * np.array([-0.5 * 0.1 - 0.2 * 0.2, -0.5 * 0.3 - 0.2 * 0.2]))
 
 
 def test_a_stroke_is_evaluated_for_a_fixed_time(parked):

@@ -31,7 +31,15 @@ from emb_daemon.adapt.learned import (
     curve_values,
     why_out_of_bounds,
 )
-from emb_daemon.adapt.pairs import FORCE, MODEL, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes, turned_angles
+from emb_daemon.adapt.pairs import (
+    FORCE,
+    MODEL,
+    WEIGHT,
+    curve_from_pairs,
+    friction_from_pairs,
+    pairs_of_passes,
+    turned_angles,
+)
 from emb_daemon.calibration.parameters import (
     INERTIA,
     LOAD_FRICTION,
@@ -85,6 +93,8 @@ def unexplained_step(s: Record, p: Record, row: Record) -> float:
     before, speed = s.force, s.speed
     stiffness_path(s, p, row, row.factor)
     torque, leverage, _ = torque_path(s, p, row)
+    # Over a training that heats the motor no torque constant explains it.
+    torque += row.faded * s.motor_torque
     s.angle, s.speed = row.angle, row.speed
     force = 0.5 * (before + s.force)
     # Driving also learns friction at low and at high speed; the fit of a training has neither.

@@ -53,7 +53,8 @@ def _run_passes(rows, p, states, direction, torque, force):
         force[i] = 0.5 * (before + s.force)
         usable = row.has_current and abs(mean) >= _TURNED_OVER
         direction[i] = (1.0 if mean > 0.0 else -1.0) if usable else 0.0
-        torque[i] = unexplained_torque(s.motor_torque, p.inertia, row.speed - speed, row.dt, 0.0, mean)
+        motor_torque = s.motor_torque * (1.0 + row.faded)
+        torque[i] = unexplained_torque(motor_torque, p.inertia, row.speed - speed, row.dt, 0.0, mean)
         past_zero, slope = through_gear(p.gear, 0.5 * (row.angle + angle) - s.gear_zero)
         torque[i] = torque[i] / (slope * s.gear_gain) - p.gear_gain * p.spring * p.gear_gain * max(past_zero, 0.0)
 

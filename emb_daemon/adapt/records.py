@@ -22,10 +22,11 @@ OUTCOMES = (
     "too uncertain", "pairs of passes disagree with the model",
 )  # fmt: skip
 
-#: Samples of one training: the fields of SAMPLE that the path models read, and the stiffness factor at that time.
+#: Samples of one training: the fields of SAMPLE that the path models read, and at that time the stiffness factor and the share
+#: by which the motor's heat has changed its torque (``faded``), as far as driving had shown it before the training.
 TRAINING = np.dtype(
     [
-        *fields("f8", "dt angle speed current_q wheel_speed wheel_pulse caliper factor"),
+        *fields("f8", "dt angle speed current_q wheel_speed wheel_pulse caliper factor faded"),
         *fields("?", "has_current has_thermocouple has_wheel_speed has_wheel_pulse"),
     ],
     align=True,
@@ -58,7 +59,7 @@ ADAPTER = np.dtype(
     [
         *fields("i8", "phase result outcome"),
         *fields("?", "asked tried started was_low was_high"),
-        *fields("f8", "power_on_angle parked_time phase_time still_time still_angle tail_time force pulse"),
+        *fields("f8", "power_on_angle parked_time phase_time still_time still_angle tail_time force pulse fade housing_fade"),
         ("parked", "?"),
         ("snapshot_ns", "i8"),
         *fields("?", "snapshot_wanted holding"),

@@ -110,6 +110,8 @@ def _begin(a, phase):
 def _collect(a, s, remembered, rows, m):
     if a.rows == 0:
         remembered[0] = s.effects
+        # Neither the training nor a start with unknown pads teaches it: other pads may look like a motor that fades.
+        a.fade, a.housing_fade = (s.error[FADE], s.error[HOUSING]) if s.stops > 0.0 else (0.0, 0.0)
     row = rows[a.rows]
     row.dt, row.angle, row.speed = m.dt, m.angle, m.speed
     # The current is the mean of one cycle, and does not belong to the acceleration over a gap.
@@ -117,7 +119,7 @@ def _collect(a, s, remembered, rows, m):
     row.wheel_speed, row.has_wheel_speed = m.wheel_speed, m.has_wheel_speed
     row.wheel_pulse, row.has_wheel_pulse = m.wheel_pulse, m.has_wheel_pulse
     row.caliper, row.has_thermocouple = m.caliper, m.has_thermocouple
-    row.factor = s.factor
+    row.factor, row.faded = s.factor, a.fade * s.winding + a.housing_fade * s.housing
     a.rows += 1
 
 
@@ -197,8 +199,8 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else sq(a.contact_sigma)
     if not kept:
         # A new curve depends on the torque constant and the inertia of the stroke.
-        faded = s.error[FADE] * s.winding + s.error[HOUSING] * s.housing
-        _replace(s, GAIN, -a.torque_error - faded, a.torque_error_sigma)
+        known = (a.fade - s.error[FADE]) * s.winding + (a.housing_fade - s.error[HOUSING]) * s.housing
+        _replace(s, GAIN, known - a.torque_error, a.torque_error_sigma)
         _replace(s, INERTIA, a.inertia_error, a.inertia_sigma)
         # Driving may still correct what the stroke left uncertain of the new curve.
         s.covariance[SCALE, SCALE] = sq(learned.stiffness_relative_sigma)

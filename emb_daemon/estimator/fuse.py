@@ -12,6 +12,7 @@ from emb_daemon.estimator.force_sensor import hear_sensor
 from emb_daemon.estimator.hypotheses import (
     ALTERNATIVES,
     DRIFT,
+    PROVEN,
     contact_sigma,
     drift_odds,
     exists,
@@ -188,7 +189,7 @@ def _predict(s, p, m, spread, warmth, known):
         if not exists(a):
             continue
         if kind == DRIFT:
-            add_drift_walks(walked, p, m.wheel_speed != 0.0, m.dt)
+            add_drift_walks(walked, p, m.wheel_speed != 0.0, a.log_odds > PROVEN, m.dt)
         predict_errors(a.error, a.covariance, decay, noise_decay, noise, walked)
         place(s, a, p, s.factor * s.scale, warmth)
     if m.dt > ONE_CYCLE_S:
