@@ -307,11 +307,12 @@ def amounts(effect: Mapping[str, Mapping[str, float]], truth: np.ndarray) -> np.
     plant = np.zeros(1, PLANT)[0]
     _put(plant, effect)
     state, result = np.zeros(1, PLANT_STATE)[0], np.empty(len(truth))
+    lagged = state["drawn"][name.removeprefix("drawn_")]
     for index, row in enumerate(truth):
         for key in _FOLLOWED:
             state[key] = row[key]
         state["pad_mean"] = row["mean"].mean()
-        result[index] = drawn_amount(plant["effects"][name], state, 0, CYCLE_S)
+        result[index] = drawn_amount(plant["effects"][name], state, lagged, CYCLE_S)
     return result
 
 

@@ -167,14 +167,14 @@ def _hold(slot: int, column: int) -> Callable:
     return alter(slot, column, change)
 
 
-def _toggle(rng, slot: int, column: int, lsb: float) -> Callable:
-    """As `_hold`, moving by a least count up and down."""
+def _toggle(rng, slot: int, column: int) -> Callable:
+    """As `_hold`, moving by a least count of a temperature, 0.1 K, up and down."""
     kept = []
 
     def change(values, _):
         if not kept and len(values):
             kept.append(values[0])
-        return kept[0] + lsb * rng.integers(-1, 2, len(values)) if kept else values
+        return kept[0] + 0.1 * rng.integers(-1, 2, len(values)) if kept else values
 
     return alter(slot, column, change)
 
@@ -622,7 +622,7 @@ def thermocouple_stuck(rng, moments, size):
 @_family
 def thermocouple_stuck_noise(rng, moments, size):
     at = moments["go_1"]
-    change = chain(_toggle(rng, wire.THERMOCOUPLE, 0, 0.1), _toggle(rng, wire.THERMOCOUPLE, 1, 0.1))
+    change = chain(_toggle(rng, wire.THERMOCOUPLE, 0), _toggle(rng, wire.THERMOCOUPLE, 1))
     return Fault("both, one least count", at, bus=during(change, at))
 
 

@@ -54,11 +54,11 @@ _LEARNING_S = 10.0
 _STARTS = {"start_clamped", "start_latched", "power_cycle", "daemon_restart", "wheel_phase_restart"}
 
 
-def _reversals(seconds: float, low_N: float, high_N: float, frequency: float = 1.6) -> sc.Schedule:
-    """Standing, the force goes up and down."""
+def _reversals(seconds: float, low_N: float, high_N: float) -> sc.Schedule:
+    """Standing, the force goes up and down, 1.6 times a second."""
     schedule = sc.stop(0.5 * (low_N + high_N), seconds)
     target = schedule.commands["target"]
-    swing = 0.5 * (high_N - low_N) * np.sin(2.0 * np.pi * frequency * CYCLE_S * np.arange(len(schedule)))
+    swing = 0.5 * (high_N - low_N) * np.sin(2.0 * np.pi * 1.6 * CYCLE_S * np.arange(len(schedule)))
     target += np.where(target > low_N, swing, 0.0)
     return schedule
 

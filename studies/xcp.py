@@ -97,14 +97,14 @@ class Master:
         self._socket.close()
 
 
-def cost_us(rounds: int = 100_000) -> tuple[float, float]:
-    """Median and 99 % quantile of the time to write four rows, over a thousand repetitions."""
+def cost_us() -> tuple[float, float]:
+    """Median and 99 % quantile of the time to write four rows, over a hundred thousand repetitions."""
     pipeline = SimpleNamespace(
         samples=np.zeros(4096, SAMPLE), estimates=np.zeros(4096, ESTIMATE), parameters=np.zeros(4, PARAMETERS)
     )
     with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
-        shared, spent = SharedEstimates(Path(folder) / "estimates", pipeline), np.zeros(rounds)
-        for index in range(rounds):
+        shared, spent = SharedEstimates(Path(folder) / "estimates", pipeline), np.zeros(100_000)
+        for index in range(len(spent)):
             begin = time.perf_counter_ns()
             shared.write(4)
             spent[index] = time.perf_counter_ns() - begin

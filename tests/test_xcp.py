@@ -258,7 +258,8 @@ def test_without_a_session_only_connect_is_answered():
 @pytest.mark.parametrize("command, code", [
     ("fc", xcp.SYNCH), ("f0 04 00 00", xcp.UNKNOWN), ("f6 00", xcp.SYNTAX), ("f4 ff 00 00 00 00 00 00", xcp.OUT_OF_RANGE),
     ("f4 04 00 00 00 00 04 00", xcp.ACCESS_DENIED), ("f4 04 00 05 00 00 00 00", xcp.ACCESS_DENIED),
-    ("d5 00 01 00", xcp.SEQUENCE), ("e1 ff 04 00 00 00 00 00", xcp.SEQUENCE), ("e2 00 00 00 00 00", xcp.OUT_OF_RANGE),
+    ("d5 00 01 00", xcp.SEQUENCE), ("d4 00 00 00 01", xcp.SEQUENCE), ("d3 00 00 00 00 01", xcp.SEQUENCE),
+    ("e1 ff 04 00 00 00 00 00", xcp.SEQUENCE), ("e2 00 00 00 00 00", xcp.OUT_OF_RANGE),
     ("dd 03", xcp.MODE_NOT_VALID), ("d7 00 04 00", xcp.OUT_OF_RANGE),
 ])  # fmt: skip
 def test_what_is_not_there_is_refused(command, code):
@@ -267,7 +268,7 @@ def test_what_is_not_there_is_refused(command, code):
     assert slave.answer(bytes.fromhex(command)) == bytes([0xFE, code])
 
 
-def test_a_running_list_is_not_changed():
+def test_a_running_list_sends_and_is_not_changed_until_it_is_stopped():
     slave = _slave()
     for command in ("ff 00", "d6", "d5 00 01 00", "d4 00 00 00 01", "d3 00 00 00 00 01", "e2 00 00 00 00 00",
                     "e1 ff 04 00 00 00 00 00", "e0 00 00 00 00 00 01 00", "de 01 00 00"):  # fmt: skip
@@ -275,6 +276,10 @@ def test_a_running_list_is_not_changed():
     assert slave.answer(b"\xfd")[1] == 0x40 and slave.acquiring
     for command in ("e2 00 00 00 00 00", "e1 ff 04 00 00 00 00 00", "e0 00 00 00 00 00 01 00", "d3 00 00 00 00 02"):
         assert slave.answer(bytes.fromhex(command)) == bytes([0xFE, xcp.DAQ_ACTIVE]), command
+    assert len(list(slave.data(0, 1))) == 1
+    for stop in ("de 00 00 00", "dd 00"):
+        assert slave.answer(bytes.fromhex("de 01 00 00"))[0] == 0xFF and slave.acquiring
+        assert slave.answer(bytes.fromhex(stop))[0] == 0xFF and not list(slave.data(0, 1)), stop
 
 
 def test_a_list_that_no_frame_carries_is_not_started():

@@ -33,7 +33,8 @@ _MOTION_RAD, _STILL_S = 0.3, 3.0
 _SMOOTHING_S, _LOW, _TAIL_S = 0.25, 0.04, 1.0
 #: States of the motor and its current sensor.
 _OF_THE_MOTOR = (GAIN, OFFSET, FADE, HOUSING, INERTIA)
-_BAD = (
+#: Reasons that prevent or end training: what it learns from is missing or doubted.
+_PREVENTING = (
     e.RESOLVER_LOST | e.CURRENT_LOST | e.THERMOCOUPLE_LOST | e.VEHICLE_STATUS_LOST | e.E2E_ERROR | e.OUT_OF_RANGE
     | e.STUCK | e.TEMPERATURE_UNCERTAIN
 )  # fmt: skip
@@ -47,7 +48,7 @@ def _obstacle(a, m, estimate, limits, others_hold):
         return r.OTHERS_NOT_HOLDING
     if not estimate.is_sample:
         return r.BAD_INPUT if estimate.source == e.INVALID else r.ACCEPTED
-    if estimate.reasons & _BAD or not m.has_status:
+    if estimate.reasons & _PREVENTING or not m.has_status:
         return r.BAD_INPUT
     if m.park_brake != e.PARK_APPLIED:
         return r.PARK_BRAKE_LEFT

@@ -69,7 +69,7 @@ class Ledger:
         self._spent = [0] * len(_PARTS)
         self._missed = self._held_up = 0
         self._settled_KiB = resident_KiB()
-        self._begun = self._ended = self._stand()
+        self._begun = self._ended = self._counts()
         for column, (_, owner, name) in enumerate(_PARTS):
             self._watch(bus if owner == "bus" else daemon.pipeline, name, column)
         daemon.tick = self._tick
@@ -102,7 +102,7 @@ class Ledger:
             self._rows[self._used] = [*self._spent, taken]
             self._used += 1
             # The ending car, at a priority above the daemon's, is a load that a real daemon does not have.
-            self._ended = self._stand()
+            self._ended = self._counts()
             if self._used == _SETTLED:
                 self._begun, self._settled_KiB = self._ended, resident_KiB()
 
@@ -112,7 +112,7 @@ class Ledger:
         if missed and is_held_up(now_ns - pacer.deadline_ns, time.process_time_ns() - pacer.worked_ns):
             self._held_up += missed
 
-    def _stand(self) -> tuple:
+    def _counts(self) -> tuple:
         return time.monotonic(), time.process_time(), self._daemon.ticks, self._daemon.missed, self._held_up
 
     def figures(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class Ledger:
         machine, memory at both ends. Since the start: costs, us."""
         # Before the figures themselves take memory: 48 bytes a tick.
         resident = [self._settled_KiB, resident_KiB()]
-        (begin, used, ticks, missed, held), end = self._begun, self._ended if self._used else self._stand()
+        (begin, used, ticks, missed, held), end = self._begun, self._ended if self._used else self._counts()
         *parts, whole = (self._rows[: self._used] / 1e3).T
         return {
             "core_share": (end[1] - used) / (end[0] - begin),

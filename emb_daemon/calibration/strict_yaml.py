@@ -89,11 +89,11 @@ class _Reader:
         optional, kind = _strip_optional(kind)
         if optional and isinstance(node, yaml.ScalarNode) and node.value in ("null", "~", ""):
             return None
-        if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        if _is_struct(kind):
             return self.struct(node, kind, path)
         container, least = _strip_length(kind)
         origin, arguments = typing.get_origin(container), typing.get_args(container)
-        if origin is tuple and arguments[-1] is Ellipsis and _holds_struct(arguments[0]):
+        if origin is tuple and arguments[-1] is Ellipsis and _is_struct(arguments[0]):
             if not isinstance(node, yaml.SequenceNode) or len(node.value) < least:
                 return self.fault(node, path, f"expected a list of at least {least}" if least else "expected a list")
             return tuple(self.convert(item, arguments[0], f"{path}[{index}]") for index, item in enumerate(node.value))
@@ -176,7 +176,7 @@ def _strip_length(kind: Any) -> tuple[Any, int]:
     return container, max((meta.min_length or 0 for meta in metas if isinstance(meta, msgspec.Meta)), default=0)
 
 
-def _holds_struct(kind: Any) -> bool:
+def _is_struct(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 
 

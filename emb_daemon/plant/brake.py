@@ -87,26 +87,19 @@ def static_angle(p: Record, force: float) -> float:
 
 @njit
 def _signal(s, which):
-    """Absolute value of a signal, over its usual size."""
-    if which == 0:
-        return abs(s.brake_torque) / _BRAKE_NM
-    if which == 1:
-        return max(s.disc - COLD_C, 0.0) / _RISE_K
-    if which == 2:
-        return max(0.5 * (s.surface[0] + s.surface[1]) - COLD_C, 0.0) / _RISE_K
-    if which == 3:
-        return max(s.force, 0.0) / _FORCE_N
-    if which == 4:
-        return abs(s.speed) / _SPEED_RAD_PER_S
-    if which == 5:
-        return abs(s.current) / _CURRENT_A
-    if which == 6:
-        return abs(s.force_rate) / _RATE_N_PER_S
-    if which == 7:
-        return abs(s.wheel_speed) / _DISC_RAD_PER_S
-    if which == 8:
-        return max(s.pad_mean - COLD_C, 0.0) / _RISE_K
-    return abs(s.brake_torque * s.wheel_speed) / _POWER_W
+    """Absolute value of one of `SIGNALS`, over its usual size."""
+    return (
+        abs(s.brake_torque) / _BRAKE_NM,
+        max(s.disc - COLD_C, 0.0) / _RISE_K,
+        max(0.5 * (s.surface[0] + s.surface[1]) - COLD_C, 0.0) / _RISE_K,
+        max(s.force, 0.0) / _FORCE_N,
+        abs(s.speed) / _SPEED_RAD_PER_S,
+        abs(s.current) / _CURRENT_A,
+        abs(s.force_rate) / _RATE_N_PER_S,
+        abs(s.wheel_speed) / _DISC_RAD_PER_S,
+        max(s.pad_mean - COLD_C, 0.0) / _RISE_K,
+        abs(s.brake_torque * s.wheel_speed) / _POWER_W,
+    )[which]
 
 
 @njit
@@ -119,16 +112,16 @@ def _apply_shape(e, x):
 
 
 @njit
-def drawn_amount(e: Record, s: Record, place: int, dt: float) -> float:
-    """Amount that one drawn effect adds; called every ``dt`` s. ``place``: where its lag is kept in the state."""
+def drawn_amount(e: Record, s: Record, lagged: Record, dt: float) -> float:
+    """Amount that one drawn effect adds; called every ``dt`` s. ``lagged``: its own of the state's ``drawn``."""
     if e.size == 0.0:
         return 0.0
     value = e.size * _apply_shape(e, _signal(s, int(e.signal)))
     if e.other >= 0.0:
         value *= _signal(s, int(e.other))
     if e.lag_s > 0.0:
-        s.drawn[place] += dt / e.lag_s * (value - s.drawn[place])
-        return s.drawn[place]
+        lagged.amount += dt / e.lag_s * (value - lagged.amount)
+        return lagged.amount
     return value
 
 
@@ -157,7 +150,7 @@ def _friction_level(p, s):
     if e.stribeck_friction.rise != 0.0:
         level *= 1.0 + e.stribeck_friction.rise * exp(-abs(s.speed) / e.stribeck_friction.speed_rad_per_s)
     level *= 1.0 + e.friction_asymmetry.asymmetry * s.friction
-    level *= max(1.0 + drawn_amount(e.drawn_gear_friction, s, 3, SUBSTEP_S), 0.1)
+    level *= max(1.0 + drawn_amount(e.drawn_gear_friction, s, s.drawn.gear_friction, SUBSTEP_S), 0.1)
     return level * max(1.0 - e.cold_grease.per_K * (s.caliper - COLD_C), 0.1)
 
 
@@ -173,7 +166,7 @@ def _cold_viscosity(p, s):
 @njit
 def move_motor(p: Record, s: Record, demand: float) -> None:
     """One sub-step of current, motor and gear under a current ``demand`` in A."""
-    e, h = p.effects, SUBSTEP_S
+    e, drawn, h = p.effects, s.drawn, SUBSTEP_S
     if s.latched:
         s.current -= s.current * h / (p.current_time + h)
         s.speed = s.speed_integral = 0.0
@@ -186,13 +179,14 @@ def move_motor(p: Record, s: Record, demand: float) -> None:
     s.current += (demand - s.current) * h / (p.current_time + h)
     fade = e.torque_constant_fade
     warm = s.caliper + fade.disc_share * (s.disc - s.caliper) + s.magnet_rise - _MAGNETS_C
-    factor = 1.0 - fade.fade_per_K * warm + drawn_amount(e.drawn_torque_constant, s, 2, SUBSTEP_S)
+    factor = 1.0 - fade.fade_per_K * warm + drawn_amount(e.drawn_torque_constant, s, drawn.torque_constant, h)
     factor -= e.torque_saturation.loss_per_A2 * s.current * s.current
     if e.motor_heat_fade.fade_per_A2 != 0.0:
         s.motor_heat += h / e.motor_heat_fade.time_constant_s * (s.current * s.current - s.motor_heat)
         factor -= e.motor_heat_fade.fade_per_A2 * s.motor_heat
     torque = p.torque_constant * factor * s.current
-    load = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s) * (1.0 + drawn_amount(e.drawn_gear_gain, s, 4, SUBSTEP_S))
+    load = p.gear_gain * slope_at(p, s.angle) * gear_load(p, s)
+    load *= 1.0 + drawn_amount(e.drawn_gear_gain, s, drawn.gear_gain, h)
     mesh = e.gear_mesh_ripple
     if mesh.cosine != 0.0 or mesh.sine != 0.0:
         phase = mesh.order_per_turn * (p.released_angle + s.angle)
@@ -241,7 +235,8 @@ def clamp(p: Record, s: Record) -> None:
     half = 0.5 * e.backlash.play_rad
     s.driven_angle = min(max(s.driven_angle, angle - half), angle + half)
     # The clearance is the motor angle until contact when closing.
-    x = s.driven_angle + half + growth(p, s) + 1e-6 * drawn_amount(e.drawn_thickness, s, 1, SUBSTEP_S) / p.gear_gain
+    x = s.driven_angle + half + growth(p, s)
+    x += 1e-6 * drawn_amount(e.drawn_thickness, s, s.drawn.thickness, SUBSTEP_S) / p.gear_gain
     x -= p.contact_angle
     s.static_force = static_curve(p, x)
     hysteresis, further = e.stiffness_hysteresis, e.second_hysteresis
@@ -252,7 +247,8 @@ def clamp(p: Record, s: Record) -> None:
         s.further_slip = min(max(s.further_slip + travel / further.slip_angle_rad, -1.0), 1.0)
     s.past_contact = x
     drive = s.stiffness_factor * s.static_force * (1.0 + hysteresis.share * s.slip + further.share * s.further_slip)
-    drive *= 1.0 + e.brake_torque_coupling.per_Nm * s.brake_torque + drawn_amount(e.drawn_stiffness, s, 0, SUBSTEP_S)
+    coupled = e.brake_torque_coupling.per_Nm * s.brake_torque
+    drive *= 1.0 + coupled + drawn_amount(e.drawn_stiffness, s, s.drawn.stiffness, SUBSTEP_S)
     excitation = drive
     if e.second_relaxation.share != 0.0:
         s.slow = _settle(s.slow, s.drive, drive, e.second_relaxation.time_constant_s)
@@ -272,9 +268,9 @@ def clamp(p: Record, s: Record) -> None:
 
 
 @njit
-def _earlier(s, history, delay, largest):
-    """A recorded value as it was ``delay`` s, at most ``largest`` sub-steps, ago."""
-    steps = min(max(delay / SUBSTEP_S, 0.0), largest)
+def _earlier(s, history, delay):
+    """A recorded value as it was ``delay`` s ago, or the oldest."""
+    steps = min(max(delay / SUBSTEP_S, 0.0), HISTORY - 2.0)
     whole = int(steps)
     share = steps - whole
     return (1.0 - share) * history[(s.history_at - whole) % HISTORY] + share * history[(s.history_at - whole - 1) % HISTORY]
@@ -283,7 +279,7 @@ def _earlier(s, history, delay, largest):
 @njit
 def delayed_angle(p: Record, s: Record) -> float:
     """Angle that the resolver measures now: the motor angle ``signal_delay`` ago."""
-    return _earlier(s, s.angle_history, p.effects.signal_delay.delay_s, HISTORY - 2.0)
+    return _earlier(s, s.angle_history, p.effects.signal_delay.delay_s)
 
 
 @njit
@@ -291,5 +287,5 @@ def delayed_mean_current(p: Record, s: Record) -> float:
     """Current that the sensor measures now: the mean over a cycle that ended ``current_delay`` ago."""
     delay, total = p.effects.current_delay.delay_s, 0.0
     for step in range(SUBSTEPS):
-        total += _earlier(s, s.current_history, delay + step * SUBSTEP_S, HISTORY - 2.0)
+        total += _earlier(s, s.current_history, delay + step * SUBSTEP_S)
     return total / SUBSTEPS

@@ -57,7 +57,7 @@ def friction_of_pads(p: Record, s: Record, wheel_speed: float) -> float:
     fade = p.effects.friction_coefficient_fade
     if fade.fade_per_K != 0.0:
         value *= max(1.0 - fade.fade_per_K * max(surface - fade.onset_C, 0.0), 0.2)
-    value *= 1.0 + drawn_amount(p.effects.drawn_pad_friction, s, 5, CYCLE_S)
+    value *= 1.0 + drawn_amount(p.effects.drawn_pad_friction, s, s.drawn.pad_friction, CYCLE_S)
     return max(value, 0.2 * p.friction_coefficient)
 
 
@@ -87,14 +87,15 @@ def _conduct(p, s, side, conductivity, flux):
 @njit
 def _heat_pads(p, s, power):
     """Friction ``power`` (W) into both pads, and what they exchange with the disc; returns heat (W) into disc and caliper."""
-    e, dt = p.effects, CYCLE_S
-    contact = p.contact_conductance * max(1.0 + drawn_amount(e.drawn_contact_conductance, s, 6, dt), 0.1)
-    gap = p.gap_conductance * max(1.0 + drawn_amount(e.drawn_gap_conductance, s, 7, dt), 0.1)
-    conductivity = p.conductivity * max(1.0 + drawn_amount(e.drawn_pad_conductivity, s, 11, dt), 0.1)
-    share = min(max(1.0 + drawn_amount(e.drawn_heat_share, s, 9, dt), 0.1), 1.0 / max(p.heat_share[0] + p.heat_share[1], 1e-9))
+    e, d, dt = p.effects, s.drawn, CYCLE_S
+    contact = p.contact_conductance * max(1.0 + drawn_amount(e.drawn_contact_conductance, s, d.contact_conductance, dt), 0.1)
+    gap = p.gap_conductance * max(1.0 + drawn_amount(e.drawn_gap_conductance, s, d.gap_conductance, dt), 0.1)
+    conductivity = p.conductivity * max(1.0 + drawn_amount(e.drawn_pad_conductivity, s, d.pad_conductivity, dt), 0.1)
+    share = max(1.0 + drawn_amount(e.drawn_heat_share, s, d.heat_share, dt), 0.1)
+    share = min(share, 1.0 / max(p.heat_share[0] + p.heat_share[1], 1e-9))
     conductance = gap + (contact - gap) * s.force / (s.force + p.touching_force)
     into_disc = (1.0 - share * p.heat_share[0] - share * p.heat_share[1]) * power
-    into_disc += drawn_amount(e.drawn_disc_heat, s, 10, dt)
+    into_disc += drawn_amount(e.drawn_disc_heat, s, d.disc_heat, dt)
     into_caliper = 0.0
     width = p.pad_thickness / cell_count(p)
     for side in range(2):
@@ -150,7 +151,7 @@ def heat_cycle(p: Record, s: Record, wheel_speed: float, ambient: float) -> None
     s.friction_heat += power * CYCLE_S
     s.wear += 1e-12 * p.effects.pad_wear.wear_um_per_MJ * power * CYCLE_S
     # Drawn effects follow the temperatures at the cycle's start.
-    cooling = max(1.0 + drawn_amount(p.effects.drawn_disc_cooling, s, 8, CYCLE_S), 0.1)
+    cooling = max(1.0 + drawn_amount(p.effects.drawn_disc_cooling, s, s.drawn.disc_cooling, CYCLE_S), 0.1)
     into_disc, into_caliper = _heat_pads(p, s, power)
     _heat_disc_and_caliper(p, s, into_disc, into_caliper, cooling, wheel_speed, ambient)
     _heat_motor(p, s)

@@ -31,6 +31,12 @@ class Field(NamedTuple):
     shape: tuple[int, ...] = ()
 
 
+#: Places where drawn effects enter.
+DRAWN = (
+    "stiffness", "thickness", "torque_constant", "gear_friction", "gear_gain", "pad_friction", "contact_conductance",
+    "gap_conductance", "disc_cooling", "heat_share", "disc_heat", "pad_conductivity",
+)  # fmt: skip
+
 #: Effects that a plant can have, all off at zero, with the names of their parameters. The catalogue's have its names and
 #: units; their physics is the plant's own. The others are not in the catalogue, so that a diagnosis can be tested on unknown
 #: effects:
@@ -54,14 +60,7 @@ EFFECTS: dict[str, tuple[str, ...]] = {
     "spindle_lead_error": ("amplitude_um", "order_per_turn", "phase_rad"),
     "cold_grease": ("per_K", "viscous_Nms_per_rad"),
     "current_delay": ("delay_s",),
-    **dict.fromkeys(
-        (
-            "drawn_stiffness", "drawn_thickness", "drawn_torque_constant", "drawn_gear_friction", "drawn_gear_gain",
-            "drawn_pad_friction", "drawn_contact_conductance", "drawn_gap_conductance", "drawn_disc_cooling",
-            "drawn_heat_share", "drawn_disc_heat", "drawn_pad_conductivity",
-        ),
-        ("size", "signal", "shape", "exponent", "other", "lag_s"),
-    ),
+    **dict.fromkeys((f"drawn_{place}" for place in DRAWN), ("size", "signal", "shape", "exponent", "other", "lag_s")),
 }  # fmt: skip
 
 EFFECT_VALUES = np.dtype([(name, fields("f8", " ".join(names))) for name, names in EFFECTS.items()], align=True)
@@ -146,8 +145,8 @@ PLANT_STATE = np.dtype(
         *fields("f8", "angle speed current friction"),
         # Clamp: backlash output, travel past contact, slip elements, drives of the relaxations and their states.
         *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower creep motor_heat"),
-        # Amounts that drawn effects add, in the order of their table.
-        ("drawn", "f8", (12,)),
+        # Amounts that drawn effects with a lag add.
+        ("drawn", [(place, fields("f8", "amount")) for place in DRAWN]),
         *fields("f8", "excitation force force_rate static_force stiffness_factor"),
         # Controller.
         ("latched", "?"),

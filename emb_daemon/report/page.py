@@ -115,7 +115,8 @@ class Page:
 
     def add_figure(self, figure: "Figure") -> str:
         """Keep a figure's data; returns the element id that holds them."""
-        self._figures.append(_inside_script(figure.to_json()))
+        # JSON that cannot end the script element that contains it.
+        self._figures.append(figure.to_json().replace("<", "\\u003c"))
         return f"f{len(self._figures)}"
 
     def render(self) -> str:
@@ -153,8 +154,3 @@ class Page:
 
 def _is_number(text: str) -> bool:
     return not text or text[0] in "+-−±<≤–" or text[0].isdigit()
-
-
-def _inside_script(text: str) -> str:
-    """JSON that cannot end the script element that contains it."""
-    return text.replace("<", "\\u003c")

@@ -102,12 +102,6 @@ def _panels(time_s: np.ndarray, estimates: np.ndarray, force_N: np.ndarray) -> l
     return panels
 
 
-def _histogram(error: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Share of all samples in each bin, percent."""
-    counts, _ = np.histogram(error, edges)
-    return 100.0 * counts / max(len(error), 1)
-
-
 def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, by_log: list[dict]) -> None:
     section = page.section("Errors", "Estimate minus reference. Conditions overlap; conditions without a sample are left out.")
     for log in by_log:
@@ -132,7 +126,11 @@ def _errors(page: Page, estimates: np.ndarray, force_N: np.ndarray, by_log: list
     edges = np.linspace(-reach, reach, _BINS + 1)
     centre = 0.5 * (edges[1:] + edges[:-1])
     styles = {"estimate": MODEL, "stiffness path": _STIFFNESS, "torque path": _TORQUE}
-    traces = [Trace(label, centre, _histogram(error, edges), styles[label]) for label, error in errors.items() if len(error)]
+    traces = [
+        Trace(label, centre, 100.0 * np.histogram(error, edges)[0] / len(error), styles[label])
+        for label, error in errors.items()
+        if len(error)
+    ]
     section.figure(
         xy_figure([Panel("Distribution of the error", "% of samples", traces)], "error / N"),
         "Beyond the axis: "

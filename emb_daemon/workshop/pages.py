@@ -62,18 +62,14 @@ class Segment:
         offset, content = address - SEGMENT_ADDRESS, self._working if self.shown == WORKING else self._files
         return content[offset : offset + size] if offset >= 0 and offset + size <= self.size else None
 
-    def covers(self, address: int, size: int) -> bool:
-        """Whether all of these bytes belong to the segment."""
-        return self.read(address, size) is not None
-
     @property
     def used(self) -> int:
         """The page that the daemon uses; after a reload or a restart it is that of the files again."""
         return FILES if self._taken != self._files and not self._on_page() else self._used
 
     def write(self, address: int, content: bytes) -> Answer:
-        """Set bytes that it `covers` on the working page. If the daemon uses this page, each complete number is sent to the
-        daemon; a number that it refuses is undone."""
+        """Set bytes of the working page, all of which can be read. If the daemon uses this page, each complete number is sent
+        to the daemon; a number that it refuses is undone."""
         offset = address - SEGMENT_ADDRESS
         end = offset + len(content)
         self._working = self._working[:offset] + content + self._working[end:]

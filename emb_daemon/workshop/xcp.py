@@ -31,7 +31,7 @@ _ACQUISITION, _CALIBRATION, _MODE, _VERSION = 0x04, 0x01, 0x80, 0x01
 _DAQ_RUNNING = 0x40
 #: GET_DAQ_PROCESSOR_INFO: dynamic lists, prescaler, time stamps; overload is reported by an event.
 _DAQ_PROPERTIES = 0x01 | 0x02 | 0x10 | 0x80
-#: Supported bits of SET_DAQ_LIST_MODE, and bits of the answer to START_STOP_DAQ_LIST.
+#: Supported bits of SET_DAQ_LIST_MODE, and bits of the answer to GET_DAQ_LIST_MODE.
 _TIMESTAMP, _SELECTED, _RUNNING = 0x10, 0x01, 0x40
 #: GET_DAQ_EVENT_INFO: for acquisition; the data of one event belong to one moment; cycle in ms.
 _EVENT_PROPERTIES, MILLISECONDS = 0x04 | 0x80, 6
@@ -43,6 +43,8 @@ _READ_ONLY, _WRITABLE = 0x0F, 0x3F
 _WHOLE = 0xFF
 #: Largest numbers of lists, of entries in all, and of ODTs (an ODT's number is a byte below the codes of responses).
 LISTS, _ENTRIES, _ODTS = 16, 4096, 0xFC
+#: Steps of a DAQ configuration. Each may follow the step before it, allocating ODTs and entries also itself.
+_NONE, _FREED, _LISTS_ALLOCATED, _ODTS_ALLOCATED, _ENTRIES_ALLOCATED = range(5)
 #: Address extension of a text that the slave provides for upload.
 _TEXT = 0xFF
 
@@ -82,6 +84,9 @@ class _List:
     running: bool = False
     waited: int = 0
 
+    def run(self, running: bool) -> None:
+        self.running, self.waited = running, 0
+
 
 class Slave:
     """One session, begun anew by each CONNECT.
@@ -112,8 +117,7 @@ class Slave:
 
     def _reset(self) -> None:
         self._lists: list[_List] = []
-        #: Step of allocation: none, freed, lists, ODTs, entries. Each may follow the step before it, or itself.
-        self._allocated = 0
+        self._step = _NONE
         self._pointer: tuple[int, int, int] | None = None
         self._address, self._text = (0, 0), b""
 
@@ -203,7 +207,7 @@ class Slave:
             raise Refusal(OUT_OF_RANGE)
         if len(content) < count:
             raise Refusal(SYNTAX)
-        if extension or not self._segment.covers(address, count):
+        if extension or self._segment.read(address, count) is None:
             raise Refusal(ACCESS_DENIED)
         if self._segment.shown != WORKING:
             raise Refusal(WRITE_PROTECTED)
@@ -293,38 +297,37 @@ class Slave:
             raise Refusal(DAQ_ACTIVE)
         return self._lists[number]
 
-    def _allocate(self, stage: int) -> None:
-        if self._allocated not in (stage - 1, stage):
+    def _check_step(self, *before: int) -> None:
+        if self._step not in before:
             raise Refusal(SEQUENCE)
 
     def _free(self) -> bytes:
-        self._lists, self._allocated, self._pointer = [], 1, None
+        self._lists, self._step, self._pointer = [], _FREED, None
         return b""
 
     def _allocate_lists(self, count: int) -> bytes:
-        if self._allocated != 1:
-            raise Refusal(SEQUENCE)
+        self._check_step(_FREED)
         if count > LISTS:
             raise Refusal(MEMORY_OVERFLOW)
-        self._lists, self._allocated = [_List() for _ in range(count)], 2
+        self._lists, self._step = [_List() for _ in range(count)], _LISTS_ALLOCATED
         return b""
 
     def _allocate_odts(self, number: int, count: int) -> bytes:
-        self._allocate(3)
+        self._check_step(_LISTS_ALLOCATED, _ODTS_ALLOCATED)
         chosen = self._list(number, idle=True)
         if sum(len(other.odts) for other in self._lists if other is not chosen) + count > self._transport.odts:
             raise Refusal(MEMORY_OVERFLOW)
-        chosen.odts, self._allocated = [[] for _ in range(count)], 3
+        chosen.odts, self._step = [[] for _ in range(count)], _ODTS_ALLOCATED
         return b""
 
     def _allocate_entries(self, number: int, odt: int, count: int) -> bytes:
-        self._allocate(4)
+        self._check_step(_ODTS_ALLOCATED, _ENTRIES_ALLOCATED)
         chosen = self._list(number, idle=True)
         if odt >= len(chosen.odts):
             raise Refusal(OUT_OF_RANGE)
         if sum(len(entries) for other in self._lists for entries in other.odts) + count > _ENTRIES:
             raise Refusal(MEMORY_OVERFLOW)
-        chosen.odts[odt], self._allocated = [(0, 0, 0)] * count, 4
+        chosen.odts[odt], self._step = [(0, 0, 0)] * count, _ENTRIES_ALLOCATED
         return b""
 
     def _set_pointer(self, number: int, odt: int, entry: int) -> bytes:
@@ -370,7 +373,7 @@ class Slave:
         if mode == 2:
             chosen.selected = True
         else:
-            self._run(chosen, bool(mode))
+            chosen.run(bool(mode))
         return bytes([self._first_odt(number)])
 
     def _start_stop(self, mode: int) -> bytes:
@@ -383,13 +386,9 @@ class Slave:
                 # The list may have changed since it was selected.
                 self._check(chosen)
         for chosen in concerned:
-            self._run(chosen, mode == 1)
+            chosen.run(mode == 1)
             chosen.selected = False
         return b""
-
-    @staticmethod
-    def _run(chosen: _List, running: bool) -> None:
-        chosen.running, chosen.waited = running, 0
 
     def _check(self, chosen: _List) -> None:
         """Refuse a list that no frame can carry, or that has no event."""
