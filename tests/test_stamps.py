@@ -733,7 +733,7 @@ def test_a_standing_wheel_may_be_measured_a_little_below_zero(tmp_path, capsys, 
     )
     frames = Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
     told, sent = capsys.readouterr().err, np.sum(frames["can_id"] == 0x182)
-    assert abs(sent / np.ptp(frames["time_ns"]) * 5e7 - measured) < 0.1
+    assert abs(sent * 1e8 / np.ptp(frames["time_ns"]) - measured) < 0.1
     assert ("VehicleSpeed is beyond 0 to 655.35" in told) == (measured < 1.0) and "times smaller" not in told
 
 
