@@ -729,7 +729,7 @@ def test_a_standing_wheel_may_be_measured_a_little_below_zero(tmp_path, capsys, 
     (tmp_path / "mapping.yaml").write_text(
         "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
         "  VEH_Status.VehicleSpeed: {signal: v, unit: km/h}\n  VEH_Status.BrakeRequest: {value: 0}\n"
-        "  VEH_Status.ParkBrake: {value: 0}\n"
+        "  VEH_Status.ParkBrake: {value: 0}\n  VEH_Status.AmbientTemp: {value: 20}\n"
     )
     frames = Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
     told, sent = capsys.readouterr().err, np.sum(frames["can_id"] == 0x182)

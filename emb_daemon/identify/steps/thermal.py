@@ -125,7 +125,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
     sigmas |= softened.sigmas if softened else {}
     for found in (rubbed, softened):
         values |= found.values if found else {}
-    if dense:
+    if any(r.has_pads for r in dense):
         parameters = to_parameters(moved(cold, values))
         spread = rmse(np.concatenate([_errors(parameters, r, False)[:8].ravel() for r in dense]))
         values["thermal.sigma_K"] = rounded(max(spread, _LEAST_SIGMA_K), 3)
@@ -226,20 +226,25 @@ def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibra
         r = _attempt(campaign, recording, log)
         if r is not None:
             temperatures[name] = _compare(name, r, parameters, figures)
-            figures[f"{name}: pads, no torque, estimated force, K"] = _as_in_a_car(log, calibration)
+            if r.has_pads:
+                figures[f"{name}: pads, no torque, estimated force, K"] = _as_in_a_car(log, calibration)
     for name, r in recordings.items():
-        error = _errors(parameters, r)
-        residuals[f"{name}: pads, torque known, K"] = rmse(error[:8])
-        residuals[f"{name}: disc, torque known, K"] = rmse(error[8])
+        _note_errors(f"{name}: {{}}, torque known, K", _errors(parameters, r), residuals)
     return temperatures, figures, residuals
+
+
+def _note_errors(name: str, error: np.ndarray, into: dict[str, float]) -> None:
+    """RMSE of what was measured."""
+    for part, rows in (("pads", error[:8]), ("disc", error[8])):
+        if np.isfinite(rows).any():
+            into[name.format(part)] = rmse(rows)
 
 
 def _compare(name: str, r: Recording, parameters: np.ndarray, into: dict[str, float]) -> Temperatures:
     every, found = max(round(0.5 / r.step_s), 1), []
     for torque_known, words in ((True, "torque known"), (False, "no torque")):
         error = _errors(parameters, r, torque_known)
-        into[f"{name}: pads, {words}, K"] = rmse(error[:8])
-        into[f"{name}: disc, {words}, K"] = rmse(error[8])
+        _note_errors(f"{name}: {{}}, {words}, K", error, into)
         found.append((error + r.measured)[:, ::every])
     return Temperatures(r.time_s[::every], r.measured[:, ::every], *found)
 
