@@ -721,7 +721,7 @@ def test_a_torque_that_is_cut_off_where_it_is_small_is_measured_all_the_same():
 
 @pytest.mark.parametrize(("least_kmh", "measured"), [(-0.3, 1.0), (-3.0, 0.5)])
 def test_a_standing_wheel_may_be_measured_a_little_below_zero(tmp_path, capsys, least_kmh, measured):
-    """A zero error of a tenth of a kilometre an hour makes no unknown speed; the table's largest value is within the message."""
+    """A zero error of some tenths of a kilometre an hour makes no unknown speed."""
     time_s = 0.1 * np.arange(400)
     speed = np.where(np.arange(400) % 2, 100.0, least_kmh)
     columns = {"t": time_s, "v": speed}

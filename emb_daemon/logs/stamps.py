@@ -34,8 +34,8 @@ _FAR, _STEPS, _FEW, _FEWEST = 0.5, 5.0, 0.02, 100
 _NONE = {*(10.0**k - 1.0 for k in range(3, 8)), *(2.0**k - n for k in (7, 8, 15, 16, 31, 32) for n in (0, 1))}
 _NO_MEASUREMENT, _AWAY = 1e20, 0.3
 #: Least number of times that a value is 0 between others, how many times further they are from it than from each other, and
-#: least share of all others that are smaller: rows are filled wherever the value is (a half, give or take 0.07 of 50 times), while
-#: a dead band, or a force that is cut off when it is small, begins and ends at the smallest.
+#: least share of all others that are smaller: rows are filled wherever the value is (a half, give or take 0.07 of 50 times),
+#: while a dead band, or a force that is cut off when it is small, begins and ends at the smallest.
 _LEAST_FILLED, _JUMPS, _ANYWHERE = 50, 3.0, 0.25
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4

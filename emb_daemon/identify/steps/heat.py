@@ -62,6 +62,8 @@ UNKNOWNS = {
     "thermal.disc.cooling_per_speed_J_per_rad_K": _Unknown(1.0),
     "thermal.disc.radiating_area_m2": _Unknown(1.0, scale=0.1),
 }
+#: Of these a disc's temperature tells without any of the pads': what it stores, and loses to air and pads.
+_OF_DISC = [key for key in UNKNOWNS if ".disc." in key or "contact_conductance" in key or "gap_conductance" in key]
 
 
 @dataclass(frozen=True)
@@ -126,10 +128,10 @@ def fit_heat(recordings: list[Recording], start: Calibration) -> HeatFit:
     """Pads and disc from recordings that heat and cool them.
 
     Residuals are strongly correlated and the equations approximate, so that a whole log counts as one episode, or, with fewer
-    than four logs, one sixth of each. Of discs alone nothing of the pads is fitted: they would take whatever the disc's law
-    lacks, and run away with it elsewhere.
+    than four logs, one sixth of each. Of discs alone nothing inside the pads is fitted: they would take whatever the disc's
+    law lacks, and run away with it elsewhere.
     """
-    told = [key for key in UNKNOWNS if ".disc." in key or any(r.has_pads for r in recordings)]
+    told = [key for key in UNKNOWNS if key in _OF_DISC or any(r.has_pads for r in recordings)]
     pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES
     blocks = [_block(r, start, pieces, told) for r in recordings]
     found = fit(blocks, {key: _free(UNKNOWNS[key], value_of(start, key)) for key in told}, tolerance=1e-4)
