@@ -28,7 +28,7 @@ _TYPED: dict[str, tuple[str, ...]] = {
     "motor_angle": ("motor_angle", "current"),
     "stiffness": (*_SLOW, "travel", "clamp_force"),
     "force": ("clamp_force",),
-    "torque_constant": ("current", "motor_speed", *_MOTOR_HEAT, *_TEMPERATURES),
+    "torque_constant": ("current", *_MOTOR_HEAT, *_TEMPERATURES),
     "torque": ("motor_speed", "motor_angle"),
     "current": ("energy", *_MOTOR_HEAT, *_TEMPERATURES),
     "relaxation_time": (*_TEMPERATURES, "clamp_force", "disc_speed", "brake_torque"),
