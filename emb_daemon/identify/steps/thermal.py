@@ -107,25 +107,32 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
     if not recordings:
         campaign.fault(
             "thermal: no log heats the pads with their thermocouples recorded; needed: thermal.tune, braking with "
-            "thermocouples in the pads; heat keeps the datasheet's nominal values and the force does not follow temperature"
+            "thermocouples in the pads, or in the disc for the disc alone; heat keeps the datasheet's nominal values and the "
+            "force does not follow temperature"
         )
         return ThermalStep(fitted={})
     heat = fit_heat(list(recordings.values()), cold)
-    terms, left_K, follows = find_terms(list(recordings.values()), moved(cold, heat.values))
+    padded = {name: r for name, r in recordings.items() if r.has_pads}
+    if not padded:
+        campaign.fault(
+            "thermal: the disc's temperature tells of the disc alone; needed for the pads: braking with thermocouples in "
+            "them; they keep the datasheet's nominal values and the force does not follow temperature"
+        )
+    terms, left_K, follows = find_terms(list(padded.values()), moved(cold, heat.values)) if padded else ((), 0.0, "")
     if terms:
         cold = structs.replace(cold, terms=terms)
         heat = fit_heat(list(recordings.values()), cold)
     values, heated = dict(heat.values), moved(cold, heat.values)
-    dense = [r for r in recordings.values() if r.dense]
+    dense = [r for r in padded.values() if r.dense]
     rubbed = _attempt(campaign, fit_friction, dense, to_parameters(heated)) if dense else None
     softened = None
-    if "pad_cooling" in recordings:
-        softened = _attempt(campaign, fit_softening, logs["pad_cooling"], recordings["pad_cooling"], heated)
+    if "pad_cooling" in padded:
+        softened = _attempt(campaign, fit_softening, logs["pad_cooling"], padded["pad_cooling"], heated)
     sigmas = heat.sigmas | ({"thermal.friction.coefficient": rubbed.sigma} if rubbed else {})
     sigmas |= softened.sigmas if softened else {}
     for found in (rubbed, softened):
         values |= found.values if found else {}
-    if any(r.has_pads for r in dense):
+    if dense:
         parameters = to_parameters(moved(cold, values))
         spread = rmse(np.concatenate([_errors(parameters, r, False)[:8].ravel() for r in dense]))
         values["thermal.sigma_K"] = rounded(max(spread, _LEAST_SIGMA_K), 3)
@@ -139,7 +146,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
         terms=terms,
         left_K=left_K,
         follows=follows,
-        hot=tuple(logs[name] for name in recordings if name == "tune" or name.startswith("integrated")),
+        hot=tuple(logs[name] for name in padded if name == "tune" or name.startswith("integrated")),
         heat=heat,
         law=law,
         friction=rubbed,
@@ -276,8 +283,8 @@ def section(page: Page, step: ThermalStep, calibration: Calibration) -> None:
     part = page.section("Pads and disc: heat")
     if step.heat is None:
         part.text(
-            "No log heats the pads: conductivity, specific heat and disc are the datasheet's nominal values, and the force "
-            "does not follow temperature. Needed: braking with thermocouples in the pads."
+            "No log heats pads or disc: all are the datasheet's nominal values, and the force does not follow temperature. "
+            "Needed: braking with thermocouples in the pads."
         )
         return
     part.text(
