@@ -23,9 +23,10 @@ from emb_daemon.identify.steps.heat import UNKNOWNS, check_excitation, fit_heat
 from emb_daemon.identify.steps.softening import fit_softening
 from emb_daemon.identify.steps.thermal import find_terms
 from emb_daemon.jit import njit
+from emb_daemon.logs.mapping import Mapping
 from emb_daemon.models.thermal import friction_power
-from emb_daemon.offline import Log, estimate
-from emb_daemon.offline.recording import Recording, simulate
+from emb_daemon.offline import Log, estimate, load_log
+from emb_daemon.offline.recording import Recording, recording, simulate
 from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
 from emb_daemon.wire.contract import CYCLE_S
@@ -139,6 +140,41 @@ def test_pads_and_disc_are_found_within_three_sigma(seed):
     # What both models say of a log that fitted nothing.
     r, _ = run_plant(truth, *_cooling(12.0, 200.0, 200.0))
     assert rmse(simulate(to_parameters(moved(START, fit.values)), r)[:, :8] - r.measured[:8].T) < 0.3
+
+
+def _disc_alone(truth, scenario, folder, name):
+    """What `recording` makes of a table of speed, brake torque and the disc's temperature that begins when it is warm."""
+    r, _ = run_plant(truth, *scenario, 0.25, np.random.default_rng(3), name)
+    begins = len(r.power) // 4
+    columns = (r.time_s, r.speed, np.divide(r.power, r.speed, where=r.speed > 0.0, out=np.zeros(len(r.power))))
+    table = np.column_stack([*columns, r.force, r.touching, r.measured[8]])[begins:]
+    np.savetxt(folder / f"{name}.csv", table, "%.6g", ",", header="t,w,torque,force,braked,disc", comments="")
+    (folder / "mapping.yaml").write_text(
+        "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
+        "  VEH_WheelSpeed.WheelSpeedFL: {signal: w, unit: rad/s}\n  VEH_Status.ParkBrake: {value: 0}\n"
+        "  VEH_Status.BrakeRequest: {signal: braked, unit: '1'}\n  VEH_Status.VehicleSpeed: {value: 0}\n"
+        f"  VEH_Status.AmbientTemp: {{value: {AMBIENT_C}}}\n  RIG_FL_Force.DiscTempRef: {{signal: disc, unit: degC}}\n"
+        "  RIG_FL_Force.ClampForceRef: {signal: force, unit: N}\n  RIG_FL_Force.BrakeTorqueRef: {signal: torque, unit: N·m}\n"
+    )
+    return recording(load_log(folder / f"{name}.csv", read=Mapping(folder / "mapping.yaml").read))
+
+
+def test_a_disc_that_was_measured_alone_tells_of_the_disc(tmp_path):
+    """Its law is found, also from a warm start; what the pads are stays the datasheet's, since nothing shows it."""
+    truth = to_parameters(_draw(np.random.default_rng(9)))
+    scenarios = {"drag": _drag(420.0), "slow": _cooling(6.0), "fast": _cooling(36.0), "unseen": _cooling(18.0, 200.0)}
+    *fitted, unseen = (_disc_alone(truth, scenario, tmp_path, name) for name, scenario in scenarios.items())
+    assert not unseen.has_pads and unseen.disc_C > AMBIENT_C + 40.0
+    fit = fit_heat(fitted, START)
+    inside = {key for key in UNKNOWNS if ".pad." in key and "contact" not in key and "gap" not in key}
+    assert set(UNKNOWNS) - set(fit.values) == inside <= set(fit.unexcited)
+    nominal_K, found_K = (
+        rmse(simulate(to_parameters(c), unseen)[:, 8] - unseen.measured[8]) for c in (START, moved(START, fit.values))
+    )
+    assert found_K < 3.0 and found_K < 0.25 * nominal_K
+    cold = replace(unseen, measured=np.where(np.isfinite(unseen.measured), AMBIENT_C, np.nan))
+    with pytest.raises(InputError, match=r"the disc rises by 0 K; at least 30 K by braking"):
+        check_excitation(cold)
 
 
 def test_no_radiation_is_found_where_there_is_none():

@@ -711,6 +711,32 @@ def test_a_coarse_sensor_about_zero_is_filled_with_nothing():
     assert not no_values(steps).any() and np.sum(steps == 0.0) > 500
 
 
+def test_a_torque_that_is_cut_off_where_it_is_small_is_measured_all_the_same():
+    """Half of a drive is without braking; zeros that fill rows stand between any values, these between the smallest."""
+    torque = 60.0 * np.abs(np.convolve(np.random.default_rng(5).normal(0.0, 1.0, 20_000), np.hanning(120), "valid"))
+    cut = np.where(torque < 200.0, 0.0, torque)
+    assert not no_values(cut).any() and np.sum(np.diff(cut == 0.0)) > 200
+    assert np.array_equal(no_values(np.where(np.arange(len(torque)) % 4, 0.0, torque)), np.arange(len(torque)) % 4 > 0)
+
+
+@pytest.mark.parametrize(("least_kmh", "measured"), [(-0.3, 1.0), (-3.0, 0.5)])
+def test_a_standing_wheel_may_be_measured_a_little_below_zero(tmp_path, capsys, least_kmh, measured):
+    """A zero error of some tenths of a kilometre an hour makes no unknown speed."""
+    time_s = 0.1 * np.arange(400)
+    speed = np.where(np.arange(400) % 2, 100.0, least_kmh)
+    columns = {"t": time_s, "v": speed}
+    (tmp_path / "a.csv").write_text("t,v\n" + "\n".join(f"{t:.1f},{v}" for t, v in zip(*columns.values(), strict=True)))
+    (tmp_path / "mapping.yaml").write_text(
+        "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
+        "  VEH_Status.VehicleSpeed: {signal: v, unit: km/h}\n  VEH_Status.BrakeRequest: {value: 0}\n"
+        "  VEH_Status.ParkBrake: {value: 0}\n  VEH_Status.AmbientTemp: {value: 20}\n"
+    )
+    frames = Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
+    told, sent = capsys.readouterr().err, np.sum(frames["can_id"] == 0x182)
+    assert abs(sent * 1e8 / np.ptp(frames["time_ns"]) - measured) < 0.1
+    assert ("VehicleSpeed is beyond 0 to 655.35" in told) == (measured < 1.0) and "times smaller" not in told
+
+
 @pytest.mark.parametrize(
     ("force", "said"),
     [

@@ -184,7 +184,7 @@ def heat_bench(logs: Iterable[Log], calibration: Calibration) -> HeatBench | Non
         except InputError:
             continue
         apart = r.measured[:, 0] - 0.5 * (r.inner[0] + r.outer[0])
-        if not np.any(np.abs(apart) > _SETTLED_K):
+        if r.has_pads and not np.any(np.abs(apart) > _SETTLED_K):
             found.append(r)
     bench = HeatBench(found, calibration) if found else None
     return bench if bench and bench.episodes >= _LEAST_EPISODES else None

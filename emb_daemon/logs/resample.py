@@ -39,6 +39,8 @@ _UNKNOWN_SHARE, _OTHER_SIGN, _CLAMPS_RAD = 0.1, 0.2, 3355.0
 CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
 #: Share of values outside our message's range that is too large for faults of an instrument; what a flag may be off by.
 _MOST_BEYOND, _FLAG = 0.01, 0.01
+#: Share of our message's range that a value may be below it and is sent as its end: a zero error. A wheel turns from more.
+_ZERO_ERROR = 1e-3
 #: Share of a cycle that a stamp may be short of a whole number of missing samples, or it is only late; share of a stamp's
 #: deviation by which the clock of numbered samples follows it: jitter is averaged over some ten samples, and a sampling period
 #: that is 5 % off leaves it a quarter of a cycle behind.
@@ -477,14 +479,16 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
             column = np.broadcast_to(np.asarray(source, float), times.shape)
             if name == "MotorAngle":
                 column = _within(message.name, column, layout["low"], layout["high"])
+            below = layout["low"] - column
+            column = np.where((below > 0.0) & (below < _ZERO_ERROR * (layout["high"] - layout["low"])), layout["low"], column)
             known = (column >= layout["low"]) & (column <= layout["high"])
             if (beyond := np.mean(np.isfinite(column) & ~known)) > _MOST_BEYOND:
                 so = "count as not measured" if is_reference else "make no frames"
                 much = np.max(np.abs(column[np.isfinite(column)])) / layout["high"]
+                smaller = f" If so, a `scale` {much:.2g} times smaller would fit, with all that it is compared with"
                 print(
                     f"{message.name}: {name} is beyond {layout['low']:g} to {layout['high']:g} in {100.0 * beyond:.3g} % of "
-                    f"the samples, which {so}; is its unit right? If so, a `scale` {much:.2g} times smaller would fit, with "
-                    "all that it is compared with",
+                    f"the samples, which {so}; is its unit right?{smaller if much > 1.0 else ''}",
                     file=sys.stderr,
                 )
             if length == 1 and (between := np.mean((column > _FLAG) & (column < 1.0 - _FLAG))) > _MOST_BEYOND:

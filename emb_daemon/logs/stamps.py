@@ -33,8 +33,10 @@ _FAR, _STEPS, _FEW, _FEWEST = 0.5, 5.0, 0.02, 100
 #: others' range that they are away, which the end of a sensor's range is not.
 _NONE = {*(10.0**k - 1.0 for k in range(3, 8)), *(2.0**k - n for k in (7, 8, 15, 16, 31, 32) for n in (0, 1))}
 _NO_MEASUREMENT, _AWAY = 1e20, 0.3
-#: Least number of times that a value is 0 between others, and how many times further they are from it than from each other.
-_LEAST_FILLED, _JUMPS = 50, 3.0
+#: Least number of times that a value is 0 between others, how many times further they are from it than from each other, and
+#: least share of all others that are smaller: rows are filled wherever the value is (a half, give or take 0.07 of 50 times),
+#: while a dead band, or a force that is cut off when it is small, begins and ends at the smallest.
+_LEAST_FILLED, _JUMPS, _ANYWHERE = 50, 3.0, 0.25
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4
 
@@ -141,8 +143,11 @@ def no_values(values: np.ndarray) -> np.ndarray:
         before, after = values[starts[: len(ends)]], values[ends]
         # What passes through zero, or has steps about it, is near it before or after.
         step = np.maximum(np.abs(after - before), np.min(np.diff(np.unique(values))))
-        filled = np.minimum(np.abs(before), np.abs(after)) > _JUMPS * step
-        if np.sum(filled) > max(_LEAST_FILLED, 0.5 * len(filled)):
+        nearer = np.minimum(np.abs(before), np.abs(after))
+        filled = nearer > _JUMPS * step
+        others = np.sort(np.abs(values[~zero]))
+        anywhere = np.median(np.searchsorted(others, nearer)) > _ANYWHERE * len(others)
+        if anywhere and np.sum(filled) > max(_LEAST_FILLED, 0.5 * len(filled)):
             none |= zero
     return none
 

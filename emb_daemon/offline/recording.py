@@ -36,7 +36,7 @@ class Recording:
 
     Attributes:
         step_s: grid.
-        inner, outer: backing plates.
+        inner, outer: backing plates; the air, where nothing of the pads was measured.
         power: mean friction power, W, from the brake torque sensor.
         touching: pads press on the disc.
         speed: mean wheel speed, rad/s.
@@ -60,6 +60,18 @@ class Recording:
     @property
     def time_s(self) -> np.ndarray:
         return self.step_s * np.arange(len(self.power))
+
+    @property
+    def has_pads(self) -> bool:
+        """Whether anything was measured in the pads; of a disc alone nobody knows how warm they are, and a few per cent of
+        the heat are theirs."""
+        return bool(np.isfinite(self.measured[:8]).any())
+
+    @property
+    def disc_C(self) -> float:
+        """The disc's temperature at the start: that of plates that have cooled with it, else its own."""
+        own = self.measured[8][np.isfinite(self.measured[8])]
+        return 0.5 * (self.inner[0] + self.outer[0]) if self.has_pads or not len(own) else float(own[0])
 
 
 def _mean_between(start: np.ndarray, end: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -86,37 +98,45 @@ def recording(log: Log) -> Recording:
     application that ends a second late would heat the disc by degrees.
 
     Raises:
-        InputError: no backing plate, wheel speed, force, torque or pad temperature in the log.
+        InputError: no wheel speed, force or torque in the log, no temperature of pads or disc, or of pads without their
+            backing plates.
     """
-    _check(log)
     reference, slow = log.reference, log.slow
+    channels = [(stamps, row) for stamps, depths in (reference.pads["inner"], reference.pads["outer"]) for row in depths]
+    channels.append((reference.time_ns, reference.disc_C))
+    channels = [(stamps[np.isfinite(row)], row[np.isfinite(row)]) for stamps, row in channels]
+    has_plates = len(slow.thermocouples["time_ns"]) > 1
+    _check(log, channels, has_plates)
 
     def seconds(time_ns):
         return 1e-9 * (time_ns - log.time_ns[0])
 
-    duration = min(log.time_s[-1], seconds(reference.pads["inner"][0][-1]))
+    duration = min(log.time_s[-1], next(seconds(stamps[-1]) for stamps, _ in channels if len(stamps)))
     step = next(step_s for longest_s, step_s in _STEPS_S if duration < longest_s)
     count = int(duration / step)
     if count < 10:
         raise InputError(f"{log.path}: {duration:.0f} s long; at least {10 * step:.0f} s are needed to identify heat")
     grid, window = step * np.arange(count), max(_PLATE_WINDOW_S, step)
 
-    def plate(values):
-        return _mean_between(grid - 0.5 * window, grid + 0.5 * window, seconds(slow.thermocouples["time_ns"]), values)
+    ambient = np.interp(grid, seconds(slow.status["time_ns"]), slow.status["AmbientTemp"])
+
+    def plate(name):
+        if not has_plates:
+            return ambient
+        times = seconds(slow.thermocouples["time_ns"])
+        return _mean_between(grid - 0.5 * window, grid + 0.5 * window, times, slow.thermocouples[name])
 
     measured = np.full((9, count), np.nan)
-    channels = [(stamps, row) for stamps, depths in (reference.pads["inner"], reference.pads["outer"]) for row in depths]
-    for row, (stamps, values) in enumerate([*channels, (reference.time_ns, reference.disc_C)]):
-        known = np.isfinite(values)
-        if known.sum() > 1:
-            measured[row] = np.interp(grid, seconds(stamps)[known], values[known])
+    for row, (stamps, values) in enumerate(channels):
+        if len(stamps) > 1:
+            measured[row] = np.interp(grid, seconds(stamps), values)
     power, touching, speed, force, often = _braking(log, seconds, count, step)
     return Recording(
         name=str(log.path),
         step_s=step,
-        inner=plate(slow.thermocouples["InnerBackplateTemp"]),
-        outer=plate(slow.thermocouples["OuterBackplateTemp"]),
-        ambient=np.interp(grid, seconds(slow.status["time_ns"]), slow.status["AmbientTemp"]),
+        inner=plate("InnerBackplateTemp"),
+        outer=plate("OuterBackplateTemp"),
+        ambient=ambient,
         power=power,
         touching=touching > 0.5,
         speed=speed,
@@ -126,15 +146,15 @@ def recording(log: Log) -> Recording:
     )
 
 
-def _check(log: Log) -> None:
+def _check(log: Log, channels: list[tuple[np.ndarray, np.ndarray]], has_plates: bool) -> None:
+    most = max(len(stamps) for stamps, _ in channels[:8])
     for what, times in (
-        ("backing plate temperatures", log.slow.thermocouples["time_ns"]),
+        ("temperature of pads or disc", channels[8][0] if most < 2 else range(most)),
+        ("backing plate temperatures", range(2) if has_plates or most < 2 else ()),
         ("wheel speeds", log.slow.wheel_speed["time_ns"]),
         ("vehicle status", log.slow.status["time_ns"]),
         ("reference clamp force", log.reference.clamp_force_N[np.isfinite(log.reference.clamp_force_N)]),
         ("reference brake torque", log.reference.brake_torque_Nm[np.isfinite(log.reference.brake_torque_Nm)]),
-        ("pad thermocouples", log.reference.pads["inner"][0]),
-        ("pad thermocouples", log.reference.pads["outer"][0]),
     ):
         if len(times) < 2:
             raise InputError(f"{log.path}: no {what}; needed to identify heat")
@@ -167,14 +187,14 @@ def _braking(log: Log, seconds, count: int, step: float) -> np.ndarray:
 
 
 @njit
-def _simulate(parameters, states, samples, step, longest, every, inner, outer, ambient, power, known, touching, speed, force,
-              out, signals):  # fmt: skip
+def _simulate(parameters, states, samples, step, longest, every, disc, inner, outer, ambient, power, known, touching, speed,
+              force, out, signals):  # fmt: skip
     p, s, m = parameters[0], states[0], samples[0]
     e, t = p.effects, p.thermal
     s.temperature_known = m.has_wheel_speed = True
     m.dt = step
     s.pads[0, :], s.pads[1, :] = inner[0], outer[0]
-    s.disc = 0.5 * (inner[0] + outer[0])
+    s.disc = disc
     for row in range(len(power)):
         if row > 0:
             _advance(s, p, m, longest, inner[row], outer[row], ambient[row])
@@ -229,6 +249,6 @@ def simulate(
         own["effects"]["terms"]["count"] = np.maximum(own["effects"]["terms"]["count"], 1)
     longest = LONGEST_S if r.step_s <= _COARSE_S else r.step_s
     records = np.zeros(1, STATE), np.zeros(1, SAMPLE)
-    inputs = (r.inner, r.outer, r.ambient, r.power, torque_known, r.touching, r.speed, r.force)
+    inputs = (r.disc_C, r.inner, r.outer, r.ambient, r.power, torque_known, r.touching, r.speed, r.force)
     _simulate(own, *records, r.step_s, longest, every, *inputs, out, signals)
     return out

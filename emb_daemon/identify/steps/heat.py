@@ -22,7 +22,7 @@ from emb_daemon.offline.recording import Recording, simulate
 #: residual is worth a twelfth of an independent one, which this standard deviation makes it.
 _RESIDUAL_EVERY_S = 5.0
 _RESIDUAL_SIGMA_K = 1.0
-#: Least rise of the pads' temperature, K, from which they are identified.
+#: Least rise of the temperature, K, from which pads and disc are identified.
 _LEAST_RISE_K = 30.0
 #: With fewer logs than this, each is cut into so many episodes.
 _FEW_LOGS, _PIECES = 4, 6
@@ -62,6 +62,8 @@ UNKNOWNS = {
     "thermal.disc.cooling_per_speed_J_per_rad_K": _Unknown(1.0),
     "thermal.disc.radiating_area_m2": _Unknown(1.0, scale=0.1),
 }
+#: Of these a disc's temperature tells without any of the pads': what it stores, and loses to air and pads.
+_OF_DISC = [key for key in UNKNOWNS if ".disc." in key or "contact_conductance" in key or "gap_conductance" in key]
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class HeatFit:
     """Pads and disc.
 
     Attributes:
-        values, sigmas: by key (`UNKNOWNS`).
+        values, sigmas: by key (`UNKNOWNS`), of those that are fitted.
         unexcited: keys of values that the logs do not show.
     """
 
@@ -115,22 +117,25 @@ def nominal_thermal(sheet: Datasheet) -> Thermal:
 
 
 def check_excitation(r: Recording) -> None:
-    """Raises InputError unless friction heats the pads enough to show how heat flows in them."""
-    rise = np.nanmax(r.measured[:8]) - np.nanmin(r.measured[:8, 0]) if np.isfinite(r.measured[:8]).any() else 0.0
+    """Raises InputError unless friction heats the pads enough, or a disc that was measured alone, to show how heat flows."""
+    what, measured = ("pads rise", r.measured[:8]) if r.has_pads else ("the disc rises", r.measured[8:])
+    rise = np.nanmax(measured) - np.nanmin(measured[:, 0] if r.has_pads else measured)
     if rise < _LEAST_RISE_K or r.power.max(initial=0.0) <= 0.0:
-        raise InputError(f"{r.name}: pads rise by {rise:.0f} K; at least {_LEAST_RISE_K:.0f} K by braking are needed")
+        raise InputError(f"{r.name}: {what} by {rise:.0f} K; at least {_LEAST_RISE_K:.0f} K by braking are needed")
 
 
 def fit_heat(recordings: list[Recording], start: Calibration) -> HeatFit:
     """Pads and disc from recordings that heat and cool them.
 
     Residuals are strongly correlated and the equations approximate, so that a whole log counts as one episode, or, with fewer
-    than four logs, one sixth of each.
+    than four logs, one sixth of each. Of discs alone nothing inside the pads is fitted: they would take whatever the disc's
+    law lacks, and run away with it elsewhere.
     """
+    told = [key for key in UNKNOWNS if key in _OF_DISC or any(r.has_pads for r in recordings)]
     pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES
-    blocks = [_block(r, start, pieces) for r in recordings]
-    found = fit(blocks, {key: _free(unknown, value_of(start, key)) for key, unknown in UNKNOWNS.items()}, tolerance=1e-4)
-    unexcited = tuple(key for key, share in found.from_prior.items() if share > _UNEXCITED)
+    blocks = [_block(r, start, pieces, told) for r in recordings]
+    found = fit(blocks, {key: _free(UNKNOWNS[key], value_of(start, key)) for key in told}, tolerance=1e-4)
+    unexcited = tuple(key for key in UNKNOWNS if found.from_prior.get(key, 1.0) > _UNEXCITED)
     return HeatFit({key: rounded(value, 6) for key, value in found.values.items()}, found.sigmas, unexcited)
 
 
@@ -141,7 +146,7 @@ def _free(unknown: _Unknown, start: float) -> Free:
     return Free(start, 1e-3 * unknown.scale, unknown.low, unknown.high, (start, unknown.spread * unknown.scale))
 
 
-def _block(r: Recording, start: Calibration, pieces: int) -> Block:
+def _block(r: Recording, start: Calibration, pieces: int, told: list[str]) -> Block:
     every = max(round(_RESIDUAL_EVERY_S / r.step_s), 1)
     measured = r.measured[:, ::every].T
     known = np.isfinite(measured)
@@ -151,4 +156,4 @@ def _block(r: Recording, start: Calibration, pieces: int) -> Block:
         return (simulate(to_parameters(moved(start, values)), r, every=every)[:, :9] - measured)[known] / _RESIDUAL_SIGMA_K
 
     count = int(known.sum())
-    return Block(residual, tuple(UNKNOWNS), np.arange(count) * pieces // max(count, 1))
+    return Block(residual, tuple(told), np.arange(count) * pieces // max(count, 1))

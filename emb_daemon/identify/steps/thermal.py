@@ -107,20 +107,27 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
     if not recordings:
         campaign.fault(
             "thermal: no log heats the pads with their thermocouples recorded; needed: thermal.tune, braking with "
-            "thermocouples in the pads; heat keeps the datasheet's nominal values and the force does not follow temperature"
+            "thermocouples in the pads, or in the disc for the disc alone; heat keeps the datasheet's nominal values and the "
+            "force does not follow temperature"
         )
         return ThermalStep(fitted={})
     heat = fit_heat(list(recordings.values()), cold)
-    terms, left_K, follows = find_terms(list(recordings.values()), moved(cold, heat.values))
+    padded = {name: r for name, r in recordings.items() if r.has_pads}
+    if not padded:
+        campaign.fault(
+            "thermal: the disc's temperature tells of the disc alone; needed for the pads: braking with thermocouples in "
+            "them; they keep the datasheet's nominal values and the force does not follow temperature"
+        )
+    terms, left_K, follows = find_terms(list(padded.values()), moved(cold, heat.values)) if padded else ((), 0.0, "")
     if terms:
         cold = structs.replace(cold, terms=terms)
         heat = fit_heat(list(recordings.values()), cold)
     values, heated = dict(heat.values), moved(cold, heat.values)
-    dense = [r for r in recordings.values() if r.dense]
+    dense = [r for r in padded.values() if r.dense]
     rubbed = _attempt(campaign, fit_friction, dense, to_parameters(heated)) if dense else None
     softened = None
-    if "pad_cooling" in recordings:
-        softened = _attempt(campaign, fit_softening, logs["pad_cooling"], recordings["pad_cooling"], heated)
+    if "pad_cooling" in padded:
+        softened = _attempt(campaign, fit_softening, logs["pad_cooling"], padded["pad_cooling"], heated)
     sigmas = heat.sigmas | ({"thermal.friction.coefficient": rubbed.sigma} if rubbed else {})
     sigmas |= softened.sigmas if softened else {}
     for found in (rubbed, softened):
@@ -139,7 +146,7 @@ def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
         terms=terms,
         left_K=left_K,
         follows=follows,
-        hot=tuple(logs[name] for name in recordings if name == "tune" or name.startswith("integrated")),
+        hot=tuple(logs[name] for name in padded if name == "tune" or name.startswith("integrated")),
         heat=heat,
         law=law,
         friction=rubbed,
@@ -226,20 +233,25 @@ def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibra
         r = _attempt(campaign, recording, log)
         if r is not None:
             temperatures[name] = _compare(name, r, parameters, figures)
-            figures[f"{name}: pads, no torque, estimated force, K"] = _as_in_a_car(log, calibration)
+            if r.has_pads:
+                figures[f"{name}: pads, no torque, estimated force, K"] = _as_in_a_car(log, calibration)
     for name, r in recordings.items():
-        error = _errors(parameters, r)
-        residuals[f"{name}: pads, torque known, K"] = rmse(error[:8])
-        residuals[f"{name}: disc, torque known, K"] = rmse(error[8])
+        _note_errors(f"{name}: {{}}, torque known, K", _errors(parameters, r), residuals)
     return temperatures, figures, residuals
+
+
+def _note_errors(name: str, error: np.ndarray, into: dict[str, float]) -> None:
+    """RMSE of what was measured."""
+    for part, rows in (("pads", error[:8]), ("disc", error[8])):
+        if np.isfinite(rows).any():
+            into[name.format(part)] = rmse(rows)
 
 
 def _compare(name: str, r: Recording, parameters: np.ndarray, into: dict[str, float]) -> Temperatures:
     every, found = max(round(0.5 / r.step_s), 1), []
     for torque_known, words in ((True, "torque known"), (False, "no torque")):
         error = _errors(parameters, r, torque_known)
-        into[f"{name}: pads, {words}, K"] = rmse(error[:8])
-        into[f"{name}: disc, {words}, K"] = rmse(error[8])
+        _note_errors(f"{name}: {{}}, {words}, K", error, into)
         found.append((error + r.measured)[:, ::every])
     return Temperatures(r.time_s[::every], r.measured[:, ::every], *found)
 
@@ -271,8 +283,8 @@ def section(page: Page, step: ThermalStep, calibration: Calibration) -> None:
     part = page.section("Pads and disc: heat")
     if step.heat is None:
         part.text(
-            "No log heats the pads: conductivity, specific heat and disc are the datasheet's nominal values, and the force "
-            "does not follow temperature. Needed: braking with thermocouples in the pads."
+            "No log heats pads or disc: all are the datasheet's nominal values, and the force does not follow temperature. "
+            "Needed: braking with thermocouples in the pads."
         )
         return
     part.text(
