@@ -49,7 +49,9 @@ _FOR_THE_LOAD = 0.5
 #: Share of the sliding friction from which it has turned over after a reversal.
 _TURNED_OVER = 0.9
 #: Effect and amplitude of what changes the torque constant by the current of its own sample.
-_BY_CURRENT = [(e.name, p.name) for e in REGISTRY if (e.hook, e.signal) == ("torque_constant", "current") for p in e.amplitudes]
+_BY_CURRENT = [
+    (e.name, p.name) for e in REGISTRY if (e.hook, e.signal) == ("torque_constant", "current") for p in e.amplitudes
+]
 #: Step of the current by which the torque of one ampere more is found, A.
 _MORE_A = 0.1
 #: Share of the samples that must have a value before a log counts as having the signal.

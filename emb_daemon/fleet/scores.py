@@ -46,12 +46,14 @@ class Cause:
         name: the effect's, or the key of a base parameter.
         shape: value of the effect's shape parameter with which it is tried, or None.
         unit: unit of the amount; base parameters are in multiples of their size.
+        thermal: whether it acts by a temperature.
     """
 
     key: str
     name: str
     shape: float | None
     unit: str
+    thermal: bool
 
     def __str__(self) -> str:
         return self.name if self.shape is None else f"{self.name} ({self.shape:g})"
@@ -123,12 +125,14 @@ class Scorer:
             probes += [Probe(own[p.name], shape) for shape in shapes for p in effect.amplitudes]
         self._probes = probes
         self._made: dict[tuple, np.void] = {}
+        thermal = {effect.name for effect in REGISTRY if effect.signal.endswith("temperature")}
         self.causes: tuple[Cause, ...] = tuple(
             Cause(
                 p.coordinate.name,
                 p.coordinate.effect or p.coordinate.name,
                 p.shape[0][1] if p.shape else None,
                 p.coordinate.unit,
+                p.coordinate.effect in thermal or p.coordinate.name.startswith("thermal."),
             )
             for p in probes
         )
