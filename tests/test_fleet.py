@@ -539,7 +539,7 @@ def test_a_misfit_is_no_season_where_a_cause_acts_by_temperature(seed):
 
 
 def test_a_cause_that_acts_by_temperature_has_no_season_but_in_a_batch():
-    """The curvature of its own law; what it explains is nobody else's season either."""
+    """The curvature of its own law; what it explains is nobody else's season either. It drifts like any other."""
     rng, fleet, factors = np.random.default_rng(5), {}, {}
     for number in range(16):
         unit, warmth = f"unit-{number}", 15.0 + 6.0 * rng.standard_normal(12)
@@ -547,12 +547,14 @@ def test_a_cause_that_acts_by_temperature_has_no_season_but_in_a_batch():
         level, in_batch = 0.05 * rng.standard_normal(4), 0.8 * (number % 2)
 
         def amounts(drive, level=level, in_batch=in_batch, warmth=warmth):
-            return level + np.array([0.8, 0.0, 0.5, in_batch]) * (warmth[drive] - 15.0) / 10.0 + 0.03 * rng.standard_normal(4)
+            season = np.array([0.8, 0.0, 0.5, in_batch]) * (warmth[drive] - 15.0) / 10.0
+            return level + season + np.array([1.5, 0.0, 0.0, 0.0]) * drive / 30.0 + 0.03 * rng.standard_normal(4)
 
         fleet[unit, "FL"] = _scores(rng, unit, amounts, 12, warmth=warmth)
     causes = [scores.Cause(f"effects.{name}", name, None, "1", name in "ad") for name in "abcd"]
-    found = findings.find(fleet, causes, "", factors, {}).seasons
-    assert {(one.where, one.cause) for one in found} == {("all units", "c"), ("batch A", "d")}
+    found = findings.find(fleet, causes, "", factors, {})
+    assert {(one.where, one.cause) for one in found.seasons} == {("all units", "c"), ("batch A", "d")}
+    assert {(one.where, one.cause) for one in found.drifts} == {("all units", "a")}
     # Without temperature in it, the same is a season of all.
     for cause in ("a", "d"):
         plain = [scores.Cause(c.key, c.name, None, "1", c.thermal and c.name != cause) for c in causes]
