@@ -319,10 +319,10 @@ def _fleet(rng, units=60, size=6, causes=12):
     return values, prints, {f"batch {n}": batch == n for n in range(3)}, {"batch": batch}
 
 
-def _read(values, prints, factors, noise=0.1):
+def _read(values, prints, factors, noise=0.1, freedom=1000):
     centre = population.centres(values, factors)
     covariance = np.broadcast_to(noise**2 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
-    return centre, population.Readings(values, centre, prints, covariance)
+    return centre, population.Readings(values, centre, prints, covariance, np.full(len(values), freedom))
 
 
 def test_what_a_batch_shares_is_found_with_its_cause_and_size():
@@ -373,6 +373,23 @@ def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
     # Were its own drives as far apart, it would be none.
     centre, readings = _read(values, prints, factors, noise=20.0)
     assert population.outliers(values - centre, readings) == []
+
+
+def test_a_unit_whose_few_drives_happen_to_agree_is_not_accused():
+    """Healthy units that differ by their noise alone, each of which knows it from four drives: twenty of those whose drives
+    scatter most lie far out, and as many of all seem sure of it. Known from a thousand drives, the same is an accusation."""
+    rng, accused = np.random.default_rng(0), {3: 0, 1000: 0}
+    for _ in range(20):
+        _, prints, _, factors = _fleet(rng)
+        true = np.where(np.arange(60) % 3 == 0, 4.0, 1.0)
+        values = true[:, None] * rng.standard_normal((60, 6))
+        told = true**2 * rng.chisquare(3, 60) / 3.0
+        centre = population.centres(values, factors)
+        noise = told[:, None, None] * np.eye(6)
+        for freedom in accused:
+            readings = population.Readings(values, centre, prints, noise, np.full(60, freedom))
+            accused[freedom] += bool(population.outliers(values - centre, readings))
+    assert accused[3] <= 1 and accused[1000] > 5, accused
 
 
 def test_what_a_workshop_could_not_confirm_is_not_reported(monkeypatch):
@@ -449,9 +466,22 @@ def test_a_unit_is_measured_by_the_scatter_of_others():
     centre, readings = _read(values, prints, factors)
     values[7] += 3.0 * prints[1]
     noise = np.broadcast_to(0.01 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
-    again = population.Readings(values, centre, prints, noise)
+    again = population.Readings(values, centre, prints, noise, np.full(len(values), 1000))
     np.testing.assert_allclose(again.filters[7], readings.filters[7], rtol=1e-9)
     assert np.abs(again.filters[8] / readings.filters[8] - 1.0).max() > 1e-3
+
+
+def test_few_healthy_units_are_ordinary():
+    """Of normal ones 0.1 % may be left out, although the scatter in twenty directions is known from sixty units only."""
+    rng, odd = np.random.default_rng(0), 0
+    for count, size in ((40, 12), (60, 20)):
+        noise = np.full((count, size, size), 0.5 * np.eye(size))
+        for _ in range(25):
+            units = rng.standard_normal((count, size))
+            readings = population.Readings(units, np.zeros(size), np.eye(size), noise, np.full(count, 10))
+            odd += int((~readings.ordinary).sum())
+    # Of 2 500; binomial, 0.1 %.
+    assert odd <= 8, odd
 
 
 def test_a_small_batch_that_scatters_more_is_not_accused_for_that():
@@ -476,7 +506,7 @@ def test_drift_and_season_are_told_apart_with_their_sizes(per_30_days, per_10_K)
             return level + np.array([moved, 0.0, 0.0, 0.0]) + 0.03 * rng.standard_normal(4)
 
         fleet[unit, "FL"] = _scores(rng, unit, amounts, 12, warmth=warmth)
-    causes = [scores.Cause(f"effects.{name}", name, None, "1") for name in "abcd"]
+    causes = [scores.Cause(f"effects.{name}", name, None, "1", False) for name in "abcd"]
     found = findings.find(fleet, causes, "", {}, {})
     for told, truth in ((found.drifts, per_30_days), (found.seasons, per_10_K)):
         assert [(one.where, one.cause) for one in told] == [("all units", "a")] * (truth != 0.0)
@@ -503,9 +533,42 @@ def test_a_misfit_is_no_season_where_a_cause_acts_by_temperature(seed):
             drive = dataset.Drive(unit, "FL", "", day * 86_400_000_000_000, f"{day:016x}")
             drives.append(scores.Score(drive, table.T @ table, 200, warmth[day]))
         fleet[unit, "FL"] = drives
-    causes = [scores.Cause(f"effects.{name}", name, None, "1") for name in "abcd"]
+    causes = [scores.Cause(f"effects.{name}", name, None, "1", False) for name in "abcd"]
     [season] = findings.find(fleet, causes, "", {}, {}).seasons
     assert season.cause == "c" and season.amount == pytest.approx(0.2, rel=0.15)
+
+
+def test_a_cause_that_acts_by_temperature_has_no_season_but_in_a_batch():
+    """The curvature of its own law; what it explains is nobody else's season either. It drifts like any other."""
+    rng, fleet, factors = np.random.default_rng(5), {}, {}
+    for number in range(16):
+        unit, warmth = f"unit-{number}", 15.0 + 6.0 * rng.standard_normal(12)
+        factors[unit] = {"batch": "AB"[number % 2]}
+        level, in_batch = 0.05 * rng.standard_normal(4), 0.8 * (number % 2)
+
+        def amounts(drive, level=level, in_batch=in_batch, warmth=warmth):
+            season = np.array([0.8, 0.0, 0.5, in_batch]) * (warmth[drive] - 15.0) / 10.0
+            return level + season + np.array([1.5, 0.0, 0.0, 0.0]) * drive / 30.0 + 0.03 * rng.standard_normal(4)
+
+        fleet[unit, "FL"] = _scores(rng, unit, amounts, 12, warmth=warmth)
+    causes = [scores.Cause(f"effects.{name}", name, None, "1", name in "ad") for name in "abcd"]
+    found = findings.find(fleet, causes, "", factors, {})
+    assert {(one.where, one.cause) for one in found.seasons} == {("all units", "c"), ("batch A", "d")}
+    assert {(one.where, one.cause) for one in found.drifts} == {("all units", "a")}
+    # Without temperature in it, the same is a season of all.
+    for cause in ("a", "d"):
+        plain = [scores.Cause(c.key, c.name, None, "1", c.thermal and c.name != cause) for c in causes]
+        assert ("all units", cause) in {(o.where, o.cause) for o in findings.find(fleet, plain, "", factors, {}).seasons}
+
+
+def test_causes_that_act_by_temperature_are_known(calibration):
+    thermal = {cause.name for cause in scores.Scorer(calibration).causes if cause.thermal}
+    assert thermal == {
+        "disc_thermal_expansion",
+        "torque_constant_fade",
+        "thermal.softening.per_K",
+        "thermal.softening.history_per_K",
+    }
 
 
 def test_a_slope_is_of_what_changes_within_units_wherever_they_are():

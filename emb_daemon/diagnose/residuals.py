@@ -48,6 +48,10 @@ _BRAKING_NM = 20.0
 _FOR_THE_LOAD = 0.5
 #: Share of the sliding friction from which it has turned over after a reversal.
 _TURNED_OVER = 0.9
+#: Effect and amplitude of what changes the torque constant by the current of its own sample.
+_BY_CURRENT = [
+    (e.name, p.name) for e in REGISTRY if (e.hook, e.signal) == ("torque_constant", "current") for p in e.amplitudes
+]
 #: Step of the current by which the torque of one ampere more is found, A.
 _MORE_A = 0.1
 #: Share of the samples that must have a value before a log counts as having the signal.
@@ -151,11 +155,10 @@ def _partial_correlation(trials: Sequence[Trial]) -> float:
 
 def _follows_current(effects: np.void) -> bool:
     """Whether the torque constant follows the current of its own sample, by the effects of PARAMETERS."""
-    own = [e for e in REGISTRY if (e.hook, e.signal) == ("torque_constant", "current")]
     terms, current = effects["terms"], list(SIGNALS).index("current")
     there = [t for t in terms["term"][: terms["count"]] if t["port"] == PORTS.index("torque_constant")]
     direct = [t for t in there if not t["memory"] and current in (t["signal"], t["other"])]
-    return bool(direct) or any(effects[e.name][p.name] for e in own for p in e.amplitudes)
+    return bool(direct) or any(effects[effect][amplitude] for effect, amplitude in _BY_CURRENT)
 
 
 class Bench:
@@ -310,7 +313,7 @@ class Bench:
         """Residual by channel over all logs, and the heat of each log (`held_heat.run_with_heat`)."""
 
         def one(trial: Trial) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-            parameters = self._parameters(trial, values)
+            parameters = self.parameters_of(trial, values)
             trace, heat = run_with_heat(trial.log.samples, parameters)
             per_ampere = self._per_ampere(trial, parameters, heat)
             return {channel: self.residual_of(trial, trace, channel, per_ampere) for channel in self.channels}, heat
@@ -318,7 +321,8 @@ class Bench:
         parts, heat = zip(*self.map(one, self.trials), strict=True)
         return {c: np.concatenate([part[c] for part in parts]) for c in self.channels}, list(heat)
 
-    def _parameters(self, trial: Trial, values: Values) -> np.void:
+    def parameters_of(self, trial: Trial, values: Values) -> np.void:
+        """PARAMETERS of a log with coordinates at ``values``, `held`."""
         return held(to_parameters(self.calibrated(values, trial.index)))[0]
 
     def _per_ampere(self, trial: Trial, parameters: np.void, heat: np.ndarray | None) -> np.ndarray | None:
@@ -398,7 +402,7 @@ class Bench:
         """One channel's residual, with the heat of a log held where it is given (`held_heat.run_held`)."""
         parts = []
         for trial, known in zip(self.trials, heat, strict=True):
-            samples, parameters = trial.log.samples, self._parameters(trial, values)
+            samples, parameters = trial.log.samples, self.parameters_of(trial, values)
             trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
             per_ampere = self._per_ampere(trial, parameters, known)
             parts.append(self.residual_of(trial, trace, channel, per_ampere))

@@ -251,7 +251,8 @@ class _Study:
         vectors = np.array([unit.values[row] for unit in self.units]) @ free
         centre = centres(vectors, self.levels)
         noise = free.T @ np.array([unit.noise[row] for unit in self.units]) @ free
-        return vectors, vectors - centre, Readings(vectors, centre, self.directions.prints_in(free), noise)
+        freedom = np.array([unit.freedom for unit in self.units])
+        return vectors, vectors - centre, Readings(vectors, centre, self.directions.prints_in(free), noise, freedom)
 
     def findings(self, calibration: str, silent: dict[str, str], left_out: dict[str, str]) -> Findings:
         level, apart, readings = self.read("level")
@@ -260,7 +261,10 @@ class _Study:
         ageing: list[Finding] = []
         for name in self.covariates[1:]:
             slopes, uneven, own = self.read(name)
-            shared = shared_causes(slopes, {ALL: self.masks[ALL]}, own, beside=False)
+            # The season of a cause that acts by temperature would be the curvature of its law, for which a misfit of the
+            # model's heat passes. It is alike in all units: more of them are only surer of it, and no batch shows it.
+            thermal = [row for row, cause in enumerate(self.causes) if cause.thermal and name == "warmth"]
+            shared = shared_causes(slopes, {ALL: self.masks[ALL]}, own, beside=False, misfits=thermal)
             shared += shared_causes(slopes, self.groups, own, beside=True)
             over[name] = self._list_shared(shared, _ACTIONS[name])
             if name == "day":

@@ -138,7 +138,7 @@ def _map(units: list[Placed]):
 
 def _trends(page: Page, found: Findings) -> None:
     caption = f"Drift per {PER_DAYS:g} days, season per {PER_K:g} K of ambient temperature; chance as for batches."
-    otherwise = "Nothing drifts, and nothing depends on the ambient temperature."
+    otherwise = "No drift is proven, and no season."
     section = _table(page, "Trend", [*found.drifts, *found.seasons], caption, otherwise)
     style = Style(ACCENT, mode="lines+markers")
     panels = [

@@ -10,7 +10,7 @@ The sample size is the number of units, not of drives or samples: p-values come 
 batch.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,10 +74,12 @@ class Unit:
     Attributes:
         values: coordinates as linear functions of the covariates, shape (m, q).
         noise: covariance of each row from drive to drive, shape (m, q, q).
+        freedom: number of drives, beyond those that the values take, from which the noise is known.
     """
 
     values: np.ndarray
     noise: np.ndarray
+    freedom: int
 
 
 def changing(units: Sequence[Sequence[Score]], directions: Directions, covariates: Sequence[np.ndarray]) -> np.ndarray:
@@ -122,7 +124,8 @@ def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndar
     values = (inverse @ (covariates.T @ right).ravel()).reshape(count, size)
     left = right - np.einsum("dab,db->da", information, covariates @ values)
     moves = (np.einsum("di,da->dia", covariates, left).reshape(drives, -1) @ inverse.T).reshape(drives, count, size)
-    return Unit(values, np.einsum("dia,dib->iab", moves, moves) * drives / max(drives - count, 1))
+    freedom = max(drives - count, 1)
+    return Unit(values, np.einsum("dia,dib->iab", moves, moves) * drives / freedom, freedom)
 
 
 def scatter_of(units: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,11 +157,11 @@ def _moments(rows: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _ordinary(distance: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """Which squared distances belong to a normal population with their median."""
-    from scipy.stats import chi2
+    """Which squared distances belong to a normal population with their median, its covariance known from as many units."""
+    from scipy.stats import f
 
-    size = units.shape[1]
-    return distance / max(float(np.median(distance)), 1e-300) <= chi2.ppf(_OUTLYING, size) / chi2.median(size)
+    count, size = units.shape
+    return distance / max(float(np.median(distance)), 1e-300) <= f.ppf(_OUTLYING, size, count) / f.median(size, count)
 
 
 def _distances(deviations: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -173,15 +176,16 @@ class Readings:
         centre: centre of each unit's groups, shape (N, q); scatter is about it.
         prints: of the causes, shape (K, q); a cause whose print is zero is never found.
         noise: covariance of each unit by its own drives, shape (N, q, q).
+        freedom: of each unit's noise, shape (N,).
 
     Attributes:
-        prints: as given.
+        prints, freedom: as given.
         ordinary: units that are not outliers, shape (N,).
         filters: by unit and cause, weights that measure its vector, shape (N, K, q).
         inverse: of the scatter's covariance, mean over the parts, shape (q, q).
     """
 
-    def __init__(self, units: np.ndarray, centre: np.ndarray, prints: np.ndarray, noise: np.ndarray):
+    def __init__(self, units: np.ndarray, centre: np.ndarray, prints: np.ndarray, noise: np.ndarray, freedom: np.ndarray):
         # With few drives even the noise is not known in all directions: half of it is taken as independent.
         typical = noise.mean(axis=0)
         typical = 0.5 * (typical + np.diag(np.diag(typical)))
@@ -197,6 +201,7 @@ class Readings:
         self.filters: np.ndarray = (along / np.maximum(np.einsum("fka,ka->fk", along, prints), 1e-300)[:, :, None])[fold]
         self.prints: np.ndarray = prints
         self._noise = noise
+        self.freedom: np.ndarray = freedom
         self.inverse: np.ndarray = self._inverse.mean(axis=0)
 
     def of(self, units: np.ndarray) -> np.ndarray:
@@ -244,12 +249,19 @@ _SECOND = 0.1
 LEAST_UNITS = 3
 
 
-def shared_causes(units: np.ndarray, groups: Mapping[str, np.ndarray], readings: Readings, beside: bool) -> list[Shared]:
+def shared_causes(
+    units: np.ndarray,
+    groups: Mapping[str, np.ndarray],
+    readings: Readings,
+    beside: bool,
+    misfits: Collection[int] = (),
+) -> list[Shared]:
     """Causes that groups of units share, one after the other, the strongest first, until none is significant.
 
     Args:
         groups: masks of the units, shape (N,).
         beside: compare groups with all other units; otherwise with zero.
+        misfits: causes that are taken out of the units like others, but are no finding.
     """
     rows, prints = readings.ordinary, readings.prints
     chosen: list[tuple[str, int]] = []
@@ -283,7 +295,7 @@ def shared_causes(units: np.ndarray, groups: Mapping[str, np.ndarray], readings:
         rivals = tuple(int(c) for c in np.flatnonzero(gains[group] >= _RIVAL * gains[group].max()) if c != cause)
         chosen.append((group, cause))
         mismatch = gain < _SECOND * first.setdefault(group, gain)
-        found.append(None if mismatch else Shared(group, cause, value, sigma, p_value, chance, rivals))
+        found.append(None if mismatch or cause in misfits else Shared(group, cause, value, sigma, p_value, chance, rivals))
         amounts = _together(units[rows], [(groups[g][rows], prints[c]) for g, c in chosen], readings, beside)
     return [replace(one, amount=float(amount)) for one, amount in zip(found, amounts, strict=True) if one]
 
@@ -327,16 +339,18 @@ class Outlier:
 
 def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
     """Units that differ from their group, shape (N, q) about its centre, largest difference first. The difference must exceed
-    both the scatter between units and that between the unit's own drives."""
+    both the scatter between units and that between the unit's own drives, each as well as it is known: ten drives tell a
+    scatter to a quarter, and of many units one has it from drives that happen to agree."""
     from scipy.stats import false_discovery_control
     from scipy.stats import t as student
 
     amounts, rows = readings.of(deviations), readings.ordinary
     freedom = max(int(rows.sum()) - 1, 1)
-    spread = np.sqrt((amounts[rows] ** 2).sum(axis=0) / freedom)
-    size = amounts / np.maximum(np.maximum(spread, readings.noise()), 1e-300)
+    spread, noise = np.sqrt((amounts[rows] ** 2).sum(axis=0) / freedom), readings.noise()
+    between = student.sf(np.abs(amounts) / np.maximum(spread, 1e-300), freedom)
+    within = student.sf(np.abs(amounts) / np.maximum(noise, 1e-300), readings.freedom[:, None])
     # Corrected for the number of causes that were tested for each unit.
-    chances = np.minimum(1.0, 2.0 * student.sf(np.abs(size), freedom).min(axis=1) * size.shape[1])
+    chances = np.minimum(1.0, 2.0 * np.maximum(between, within).min(axis=1) * amounts.shape[1])
     q_values = false_discovery_control(chances)
     found = []
     for row in np.flatnonzero(q_values <= FALSE_UNITS):
@@ -344,7 +358,8 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
         cause = int(gains.argmax())
         rivals = tuple(int(c) for c in np.flatnonzero(gains >= _RIVAL * gains.max()) if c != cause)
         amount = float(amounts[row, cause])
-        found.append(Outlier(int(row), cause, amount, abs(amount / float(size[row, cause])), float(q_values[row]), rivals))
+        sigma = float(max(spread[cause], noise[row, cause]))
+        found.append(Outlier(int(row), cause, amount, sigma, float(q_values[row]), rivals))
     return sorted(found, key=lambda one: (one.chance, -abs(one.amount / one.sigma)))
 
 
