@@ -22,6 +22,7 @@ from emb_daemon.models.lateness import (
     stand,
     turned_within,
     unfilter,
+    way_beside,
 )
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
 from emb_daemon.offline import estimate
@@ -78,6 +79,26 @@ def test_what_the_motor_has_turned_since_is_the_way_of_its_speeds(age, apart):
             way = angle(now) - angle(now - abs(age))
             # Between two samples the speed is off its chord by an eighth of the curvature at most.
             assert turned_within(w, age) == pytest.approx(np.sign(age) * way, abs=(apart * 9.0) ** 2 * 90.0 / 8.0 * abs(age))
+
+
+def _most_apart(angle_age, speed_age, known):
+    """Largest difference (rad) of the angle's way in a sample from the one that it is held against, ages in s."""
+    (angle, speed), w, most = _strokes(), np.zeros(1, LATELY)[0], 0.0
+    for now in np.arange(0.0, 2.0, _DT):
+        travel = angle(now - angle_age) - angle(now - angle_age - _DT)
+        way = way_beside(w, travel, speed(now - speed_age), speed(now - speed_age - _DT), known, _DT)
+        most = max(most, abs(travel - way)) if now > 0.2 else 0.0
+        remember(w, speed(now - speed_age), _DT)
+    return most
+
+
+@pytest.mark.parametrize("age", [0.001, 0.006, 0.013, 0.03, 0.05])
+def test_an_angle_known_to_be_late_is_held_against_the_speeds_of_its_own_moment(age):
+    assert _most_apart(age, 0.0, known=age) < 2e-4
+    assert _most_apart(age, 0.0, known=0.0) > 0.9 * 810.0 * age * _DT * np.sinc(9.0 * age / 2.0 / np.pi)
+    # What made the angle late may have made the speed so, too, and one that is early has none of its own moment yet.
+    assert _most_apart(age, age, known=age) < 2e-4
+    assert _most_apart(0.0, 0.0, known=-age) < 2e-4
 
 
 def test_no_age_is_no_way_and_before_the_first_speeds_the_motor_turned_at_those():

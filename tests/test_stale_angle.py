@@ -69,7 +69,7 @@ def _zeros_moved(p, angles, speeds):
     for angle, speed in zip(angles, speeds, strict=True):
         m["angle"], m["speed"], m["dt"] = angle, speed, 0.004
         moved.append(bool(follow_zero(s, p, m)))
-        watch(s["plausibility"], m, s["angle"], s["speed"], 0.0, 1.0, True)
+        watch(s["plausibility"], m, s["angle"], s["speed"], 0.5 * (m["speed"] + s["speed"]) * m["dt"], 0.0, 1.0, True)
         s["angle"], s["speed"] = angle, speed
     return moved
 

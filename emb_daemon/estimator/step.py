@@ -49,7 +49,7 @@ from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
-from emb_daemon.models.lateness import find_filter, follow, interrupt, stand, unfilter
+from emb_daemon.models.lateness import find_filter, follow, interrupt, stand, unfilter, way_beside
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, believe_resolver, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
@@ -141,7 +141,9 @@ def _advance(s, p, m, angle, speed, out):
         _start(s, p, m)
     moved_zero = follow_zero(s, p, m)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
-        watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT]), s.contact.confirmed)
+        known, sigma = effects.known_delay(p.effects), sqrt(s.covariance[CONTACT, CONTACT])
+        turned = way_beside(s.lately, m.angle - s.angle, m.speed, s.speed, known, m.dt)
+        watch(s.plausibility, m, s.angle, s.speed, turned, s.past_contact, sigma, s.contact.confirmed)
     other_speed = _follow_age(s, p, m, moved_zero)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
