@@ -4,7 +4,6 @@ from math import sqrt
 
 import numpy as np
 
-from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, doubt_memory, rest, shift_zero, turned
@@ -25,7 +24,6 @@ from emb_daemon.models.contact import (
 )
 from emb_daemon.models.fusion import CONTACT, GAIN, OFFSET, STATES
 from emb_daemon.models.gear import steepest, through_gear
-from emb_daemon.models.lateness import way_beside
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 
@@ -66,9 +64,9 @@ _CLAMPED = 0.1
 
 
 @njit
-def follow_zero(s: Record, p: Record, m: Record) -> bool:
-    """Whether the resolver's zero has moved, because its angle changed without a motion by the speed; the contact angle is
-    moved with it.
+def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
+    """Whether the resolver's zero has moved, because its angle changed without a motion by the speed, which has ``turned`` rad
+    since the last sample; the contact angle is moved with it.
 
     The shift follows from the speed. If the resolver had been frozen the motor may have turned meanwhile, and an impossible
     motion may have any cause; then the contact angle becomes uncertain by as much. A resolver that loses counts loses a few in
@@ -81,7 +79,6 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
     reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
     moved, sigma = 0.0, 0.0
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
-    turned = way_beside(s.lately, jump, m.speed, s.speed, effects.known_delay(p.effects), m.dt)
     slip = jump - turned
     # A speed that was late is as far off as one that went through the filter that is undone in its place.
     unsure = (_SLIP_DELAY_S + s.lateness.filtered) * abs(m.speed - s.speed) + SLIP_RAD

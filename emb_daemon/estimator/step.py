@@ -139,12 +139,12 @@ def _advance(s, p, m, angle, speed, out):
     """`step` with current and motion of one moment; ``angle`` and ``speed`` as they came."""
     if not s.started:
         _start(s, p, m)
-    moved_zero = follow_zero(s, p, m)
+    turned = way_beside(s.lately, m.angle - s.angle, m.speed, s.speed, effects.known_delay(p.effects), m.dt)
+    moved_zero = follow_zero(s, p, m, turned)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
-        known, sigma = effects.known_delay(p.effects), sqrt(s.covariance[CONTACT, CONTACT])
-        turned = way_beside(s.lately, m.angle - s.angle, m.speed, s.speed, known, m.dt)
+        sigma = sqrt(s.covariance[CONTACT, CONTACT])
         watch(s.plausibility, m, s.angle, s.speed, turned, s.past_contact, sigma, s.contact.confirmed)
-    other_speed = _follow_age(s, p, m, moved_zero)
+    other_speed = _follow_age(s, p, m, turned, moved_zero)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
     knew = s.temperature_known
@@ -196,9 +196,9 @@ def _advance(s, p, m, angle, speed, out):
 
 
 @njit
-def _follow_age(s, p, m, moved_zero):
+def _follow_age(s, p, m, turned, moved_zero):
     """Age of the angle beyond the calibration's, and whether its zero wanders; whether the speed is another from now on."""
-    travel, turned, gained = m.angle - s.angle, 0.5 * (m.speed + s.speed) * m.dt, m.speed - s.speed
+    travel, gained = m.angle - s.angle, m.speed - s.speed
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero and s.drifting_s == 0.0
     if seen and s.plausibility.verdict != STIFFNESS_WRONG:
         watch_wander(s.wander, travel, turned, m.speed, gained, s.speed_sigma, m.dt)
@@ -210,7 +210,7 @@ def _follow_age(s, p, m, moved_zero):
         interrupt(s.lateness)
         return False
     follow(s.lateness, travel, turned, gained, s.speed_sigma, m.dt)
-    s.late = max(s.lateness.age - effects.known_delay(p.effects), 0.0) if p.clearance_sigma > 0.0 else 0.0
+    s.late = s.lateness.age if p.clearance_sigma > 0.0 else 0.0
     if p.clearance_sigma == 0.0 or not find_filter(s.lateness):
         return False
     # The way so far was beside another speed, and what it told of the brake is wrong.
