@@ -194,8 +194,8 @@ class Effect:
     def __post_init__(self) -> None:
         if self.hook not in HOOKS:
             raise ValueError(f"effect {self.name}: there is no hook {self.hook}; there are {', '.join(HOOKS)}")
-        if self.name in _TAKEN or not self.name.isidentifier():
-            raise ValueError(f"effect {self.name}: expected a name in letters, digits and _ that no argument of a hook has")
+        if self.name in _TAKEN:
+            raise ValueError(f"effect {self.name}: expected another name, which no argument of a hook has")
         offered = {"p", "value", *HOOKS[self.hook].arguments} | ({"s"} if self.state is not None else set())
         offered |= {"signals"} if self.hook in PORTS else set()
         if unknown := set(self.arguments) - offered:
