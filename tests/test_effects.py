@@ -108,7 +108,7 @@ def test_nothing_else_knows_an_effect_by_name(effect):
         ({"hook": "gearbox"}, "no hook gearbox"),
         ({"hook": "current"}, "current does not offer mean_speed"),
         # Composed with the others it would hide what they are given.
-        *(({"name": name}, f"effect {name}: expected a name") for name in ("travel", "mean_speed", "m", "value", "s")),
+        *(({"name": name}, f"effect {name}: expected another") for name in ("travel", "mean_speed", "m", "value", "s")),
     ],
 )
 def test_an_effect_that_cannot_be_hooked_in_is_refused(changed, said):
