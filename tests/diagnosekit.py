@@ -1,5 +1,7 @@
 """Drives of simulated brakes for the tests of diagnosis."""
 
+import dataclasses
+
 import numpy as np
 
 from emb_daemon.plant.derive import plant_from_calibration
@@ -22,3 +24,10 @@ def drives(calibration, seed, effects, reference=True, stops=5, drive=drive):
     schedules = [drive(plant, rng, stops) for _ in range(2)]
     for k, schedule in enumerate(schedules, start=1):
         yield simulate_log(plant, schedule, seed=seed + k, reference=reference)[0]
+
+
+def with_late_angle(log, samples):
+    """The log with motor angles that are so many ``samples`` old, beside speeds that are not."""
+    rows = log.samples.copy()
+    rows["angle"] = np.concatenate([np.full(samples, rows["angle"][0]), rows["angle"][:-samples]])
+    return dataclasses.replace(log, samples=rows)

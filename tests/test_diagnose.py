@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from browserkit import assert_is_drawn
-from diagnosekit import drive, drives
+from diagnosekit import drive, drives, with_late_angle
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import moved
@@ -189,6 +189,22 @@ def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monke
     assert not finding.accepted and finding.p_value > 0.01
     assert tried and not any("disc_thickness_variation" in name for name in tried)
     assert "disc_thickness_variation" not in result.calibration.effects
+
+
+@pytest.mark.trial
+@pytest.mark.parametrize("samples", [3, 8, 12])
+def test_an_angle_that_is_many_samples_old_is_no_relaxation(calibration, samples):
+    fit_log, val_log = (with_late_angle(log_of(frames), samples) for frames in drives(calibration, 57, {}))
+    result = diagnose([fit_log], calibration, [val_log])
+    [finding] = result.accepted
+    assert finding.effect.name == "signal_delay"
+    assert finding.values["delay_s"] == pytest.approx(0.004 * samples, abs=8e-4)
+    assert "stiffness.relaxation_time_s" not in result.recalibrated or (
+        result.recalibrated["stiffness.relaxation_time_s"].value
+        == pytest.approx(calibration.stiffness.relaxation_time_s, rel=0.1)
+    )
+    assert result.before.rmse("fused") > 100.0 and result.after.rmse("fused") < 60.0
+    assert result.unexplained is None
 
 
 @pytest.mark.trial

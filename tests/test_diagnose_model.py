@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from diagnosekit import drives
+from diagnosekit import drives, with_late_angle
 
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.terms import Term
@@ -16,7 +16,7 @@ from emb_daemon.diagnose import selection as selection_module
 from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.model import Model
-from emb_daemon.diagnose.residuals import Bench
+from emb_daemon.diagnose.residuals import Bench, make_trial
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.selection import Selection
 from emb_daemon.effects import REGISTRY
@@ -179,6 +179,18 @@ def test_noise_of_the_current_counts_alike_where_its_constant_follows_it(calibra
     assert np.abs(log.samples["current_q"][there]).max() > 8.0
     noise = (more.residuals({})["torque"] - left)[there]
     np.testing.assert_allclose(noise, bench.newton_per_ampere / 12.0, rtol=0.03)
+
+
+def test_a_search_begins_with_what_signals_alone_tell_and_only_far_from_the_calibration(calibration):
+    log, key = log_of(next(drives(calibration, 61, {}, stops=1))), "effects.signal_delay.delay_s"
+    late = with_late_angle(log, 5)
+    bench = Bench([late], calibration)
+    [(coordinate, age)] = search._told(Model.of(bench)).items()
+    assert (coordinate.name, bench.told) == (key, {key: age}) and age == pytest.approx(0.02, abs=3e-4)
+    assert not Bench([log], calibration).told and not Bench([late], moved(calibration, {key: 0.017})).told
+    # Where friction has turned over is told by the motor, and not by the late angle.
+    in_time, untold = (make_trial(which, 0, held(to_parameters(calibration))[0], {}).slides for which in (log, late))
+    assert np.mean(bench.trials[0].slides != in_time) < 0.5 * np.mean(untold != in_time)
 
 
 def test_a_ripple_keeps_its_phase_where_the_angles_are_when_its_order_moves(calibration):

@@ -18,7 +18,7 @@ from numba.core import config
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.effects import REGISTRY
+from emb_daemon.effects import REGISTRY, signal_delay
 from emb_daemon.effects.gear_mesh_ripple import cycle_mean
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.models.wheel import wheel_angle
@@ -106,7 +106,13 @@ def test_nothing_else_knows_an_effect_by_name():
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"), [({"hook": "gearbox"}, "no hook gearbox"), ({"hook": "current"}, "current does not offer mean_speed")]
+    ("changed", "said"),
+    [
+        ({"hook": "gearbox"}, "no hook gearbox"),
+        ({"hook": "current"}, "current does not offer mean_speed"),
+        # Composed with the others it would hide what they are given.
+        *(({"name": name}, f"effect {name}: expected another") for name in ("travel", "mean_speed", "m", "value", "s")),
+    ],
 )
 def test_an_effect_that_cannot_be_hooked_in_is_refused(changed, said):
     viscous = next(effect for effect in REGISTRY if effect.name == "viscous_friction")
@@ -218,6 +224,31 @@ def test_acts_on_its_own_path(effect):
 def force(p, samples):
     p["clearance_sigma"] = p["contact_walk"] = 0.0
     return estimate(samples, p)["stiffness_force"]
+
+
+def _turned(late_s, speed_late_s=0.0, samples=2500):
+    """SAMPLE rows of a motor that turns to and fro, its angle and speed late, with noise and an offset of the speed."""
+    rng, time = np.random.default_rng(3), 0.004 * np.arange(samples)
+    rows = np.zeros(samples, SAMPLE)
+    rows["dt"][1:] = 0.004
+    way = lambda t: 12.0 * np.sin(3.0 * t) ** 3  # noqa: E731
+    rows["angle"] = way(time - late_s)
+    rows["speed"] = np.gradient(way(time - speed_late_s), 0.004) + 0.3 * rng.standard_normal(samples) + 0.1
+    return rows
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.003, 0.01, 0.0317, 0.048])
+def test_the_speed_tells_how_old_the_angle_is(late_s):
+    age, sigma = signal_delay.measure(_turned(late_s))
+    assert abs(age - late_s) < 5.0 * sigma + 1e-4 and sigma < 2e-4
+
+
+def test_what_is_late_with_its_speed_or_before_it_is_not_old():
+    for late_s, speed_late_s in ((0.03, 0.03), (0.0, 0.03)):
+        assert signal_delay.measure(_turned(late_s, speed_late_s))[0] < 2e-4
+    still = _turned(0.0)
+    still["angle"] = still["speed"] = 0.0
+    assert signal_delay.measure(still)[1] == signal_delay.measure(still[:30])[1] == np.inf
 
 
 def test_thickness_variation_stands_still_with_the_wheel():

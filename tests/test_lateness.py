@@ -22,6 +22,7 @@ from emb_daemon.models.lateness import (
     stand,
     turned_within,
     unfilter,
+    way_beside,
 )
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
 from emb_daemon.offline import estimate
@@ -78,6 +79,26 @@ def test_what_the_motor_has_turned_since_is_the_way_of_its_speeds(age, apart):
             way = angle(now) - angle(now - abs(age))
             # Between two samples the speed is off its chord by an eighth of the curvature at most.
             assert turned_within(w, age) == pytest.approx(np.sign(age) * way, abs=(apart * 9.0) ** 2 * 90.0 / 8.0 * abs(age))
+
+
+def _most_apart(angle_age, speed_age, known):
+    """Largest difference (rad) of the angle's way in a sample from the one that it is held against, ages in s."""
+    (angle, speed), w, most = _strokes(), np.zeros(1, LATELY)[0], 0.0
+    for now in np.arange(0.0, 2.0, _DT):
+        travel = angle(now - angle_age) - angle(now - angle_age - _DT)
+        way = way_beside(w, travel, speed(now - speed_age), speed(now - speed_age - _DT), known, _DT)
+        most = max(most, abs(travel - way)) if now > 0.2 else 0.0
+        remember(w, speed(now - speed_age), _DT)
+    return most
+
+
+@pytest.mark.parametrize("age", [0.001, 0.006, 0.013, 0.03, 0.05])
+def test_an_angle_known_to_be_late_is_held_against_the_speeds_of_its_own_moment(age):
+    assert _most_apart(age, 0.0, known=age) < 2e-4
+    assert _most_apart(age, 0.0, known=0.0) > 0.9 * 810.0 * age * _DT * np.sinc(9.0 * age / 2.0 / np.pi)
+    # What made the angle late may have made the speed so, too, and one that is early has none of its own moment yet.
+    assert _most_apart(age, age, known=age) < 2e-4
+    assert _most_apart(0.0, 0.0, known=-age) < 2e-4
 
 
 def test_no_age_is_no_way_and_before_the_first_speeds_the_motor_turned_at_those():
@@ -312,6 +333,10 @@ def s():
     return new_state()[0]
 
 
+#: Way (rad) by the speed in the sample of `_turning`.
+_TURNED = 0.5 * 100.0 * _DT
+
+
 def _turning(p):
     """A sample of a motor that gains speed, whose angle is 5 ms late."""
     m = brake.samples(p, np.zeros(2))[0][1]
@@ -325,13 +350,13 @@ def test_what_a_late_speed_leaves_where_a_filter_is_undone_moves_no_zero(paramet
     m = _turning(parameters[0])
     s["speed"], s["lateness"]["filtered"] = 60.0, filtered_s
     m["angle"] = 0.5 * (100.0 + 60.0) * _DT + 0.8
-    assert follow_zero(s, parameters[0], m) == moved
+    assert follow_zero(s, parameters[0], m, 0.5 * (100.0 + 60.0) * _DT) == moved
 
 
 @pytest.mark.parametrize("what", ["nothing", "zero moved", "no time", "a sample missing", "drifting", "frozen"])
 def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
     m = _turning(parameters[0])
-    step._follow_age(s, parameters[0], m, False)
+    step._follow_age(s, parameters[0], m, _TURNED, False)
     before = s["lateness"].copy()
     assert before["apart"] != 0.0 and before["gained"] == 100.0
     if what == "no time":
@@ -343,22 +368,24 @@ def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
     elif what == "frozen":
         # The angle stands while the speed goes on.
         s["plausibility"]["still"] = 5
-    step._follow_age(s, parameters[0], m, what == "zero moved")
+    step._follow_age(s, parameters[0], m, _TURNED, what == "zero moved")
     followed = what == "nothing"
     assert (s["lateness"]["gained"] != 0.0) == (s["lateness"]["apart"] != 0.0) == followed
     assert (s["lateness"]["sums"][0] != before["sums"][0]) == followed
 
 
-def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters, s):
+@pytest.mark.parametrize(("known_s", "left_s"), [(0.0, 0.007), (0.004, 0.003), (0.007, 0.0), (0.009, 0.0)])
+def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters, s, known_s, left_s):
     p, m = parameters[0], _turning(parameters[0])
-    s["lateness"]["sums"] = 1e9 * np.array([1.0, 0.0, 1.0, -0.005, 0.0])
-    step._follow_age(s, p, m, False)
-    assert s["late"] == pytest.approx(0.005, rel=0.01)
-    p["effects"]["signal_delay"]["delay_s"] = 0.003
-    step._follow_age(s, p, m, False)
-    assert s["late"] == pytest.approx(0.002, rel=0.02)
+    p["effects"]["signal_delay"]["delay_s"] = known_s
+    for m["angle"], m["speed"] in zip(*_signals(late_s=0.007, seconds=10.0), strict=True):
+        turned = way_beside(s["lately"], m["angle"] - s["angle"], m["speed"], s["speed"], known_s, _DT)
+        step._follow_age(s, p, m, turned, False)
+        remember(s["lately"], m["speed"], _DT)
+        s["angle"], s["speed"] = m["angle"], m["speed"]
+    assert s["late"] == pytest.approx(left_s, abs=4e-4)
     p["clearance_sigma"] = 0.0
-    step._follow_age(s, p, m, False)
+    step._follow_age(s, p, m, 0.0, False)
     assert s["late"] == 0.0
 
 

@@ -42,7 +42,7 @@ class Watched:
             m["angle"] += follows * speed * _DT + angle_noise * self._noise.standard_normal()
             m["speed"] = speed
             m["current_q"] = self._noise.standard_normal() if current is None else current
-            verdict = watch(self.c[0], m, angle, before, past_contact, 0.1, confirmed)
+            verdict = watch(self.c[0], m, angle, before, 0.5 * (m["speed"] + before) * m["dt"], past_contact, 0.1, confirmed)
         return verdict
 
 

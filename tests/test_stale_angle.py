@@ -68,8 +68,9 @@ def _zeros_moved(p, angles, speeds):
     moved = []
     for angle, speed in zip(angles, speeds, strict=True):
         m["angle"], m["speed"], m["dt"] = angle, speed, 0.004
-        moved.append(bool(follow_zero(s, p, m)))
-        watch(s["plausibility"], m, s["angle"], s["speed"], 0.0, 1.0, True)
+        turned = 0.5 * (m["speed"] + s["speed"]) * m["dt"]
+        moved.append(bool(follow_zero(s, p, m, turned)))
+        watch(s["plausibility"], m, s["angle"], s["speed"], turned, 0.0, 1.0, True)
         s["angle"], s["speed"] = angle, speed
     return moved
 

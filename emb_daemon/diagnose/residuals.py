@@ -54,6 +54,9 @@ _BY_CURRENT = [
 ]
 #: Step of the current by which the torque of one ampere more is found, A.
 _MORE_A = 0.1
+#: Samples from which a search begins where signals alone say: a speed that is the mean of its cycle, or a frame that waits for
+#: the next, is off by up to one, and so near the catalogue's own test leads there. Standard deviations that are certain.
+_FAR, _SURELY = 2.0, 5.0
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -153,6 +156,25 @@ def _partial_correlation(trials: Sequence[Trial]) -> float:
     return float(products[0, 1] ** 2 / size) if size > 0.0 else 0.0
 
 
+def _told_by_signals(logs: Sequence[Log], calibration: Calibration) -> dict[str, float]:
+    """Amplitudes that signals alone tell (`Effect.measure`) and that are surely some samples from the calibration's."""
+    result = {}
+    for effect in REGISTRY:
+        if effect.measure is None:
+            continue
+        [amplitude] = effect.amplitudes
+        found = np.array([effect.measure(log.samples) for log in logs])
+        weight = 1.0 / np.maximum(found[:, 1], 1e-12) ** 2
+        if not weight.any():
+            continue
+        value, sigma = float(found[:, 0] @ weight / weight.sum()), float(weight.sum() ** -0.5)
+        apart = abs(value - max(calibration.effects.get(effect.name, {}).get(amplitude.name, 0.0), 0.0))
+        sample_s = max(float(np.median(log.samples["dt"])) for log in logs)
+        if apart > max(_FAR * sample_s, _SURELY * sigma) and value < amplitude.high:
+            result[f"effects.{effect.name}.{amplitude.name}"] = value
+    return result
+
+
 def _follows_current(effects: np.void) -> bool:
     """Whether the torque constant follows the current of its own sample, by the effects of PARAMETERS."""
     terms, current = effects["terms"], list(SIGNALS).index("current")
@@ -187,9 +209,11 @@ class Bench:
         # A thread that waits for one other costs more than what most of these tasks do.
         self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(workers).map if workers > 1 else map
         mounted = mounted or [{}] * len(logs)
+        #: By key of the calibration, what signals alone tell of effects, where that is far from what it says.
+        self.told: dict[str, float] = _told_by_signals(logs, calibration)
 
         def trial(index: int, log: Log, here: Mapping[str, float]) -> Trial:
-            return make_trial(log, index, held(to_parameters(moved(calibration, here)))[0], here)
+            return make_trial(log, index, held(to_parameters(moved(calibration, {**here, **self.told})))[0], here)
 
         self.trials: list[Trial] = list(self.map(trial, range(len(logs)), logs, mounted))
         self.has_reference: bool = all(trial.has_force for trial in self.trials)

@@ -10,10 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from emb_daemon.diagnose.coordinates import Coordinate, effect_coordinates
 from emb_daemon.diagnose.grammar import make_terms
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
-from emb_daemon.diagnose.screening import Screening
+from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.selection import (
     Progress,
     Selection,
@@ -32,9 +33,11 @@ def select(bench: Bench, progress: Progress) -> Selection:
 
     ``progress``: what is being done, share done."""
     progress("recalibrating", 0.1)
-    start = Model.of(bench)
+    begin = Model.of(bench)
+    known = _told(begin)
+    start = begin.entered(known, centre=known) if known else begin
     model = start.settled(bench.channels)
-    screening = Screening(bench, start)
+    screening = Screening(bench.under(bench.calibrated(start.values)) if known else bench, begin)
     at_first = {
         channel: dependences(
             channel, screening.dependence(model, channel), model.counted(channel), screening.floor(model, channel)
@@ -42,7 +45,7 @@ def select(bench: Bench, progress: Progress) -> Selection:
         for channel in bench.channels
         if channel in FORCE_CHANNELS
     }
-    selection = Selection(model, screening, at_first=at_first)
+    selection = Selection(model, screening, at_first=at_first).noted(_found(model, c) for c in known if not c.start)
     selection = replace(selection, recalibrated=find_recalibrated(selection, start, bench.channels))
     if bench.own_data and not _anything_left(selection):
         return find_changes(recalibrate_heat(selection))
@@ -55,6 +58,27 @@ def select(bench: Bench, progress: Progress) -> Selection:
     selection = make_terms(selection, lambda text: progress(text, 0.72))
     progress("refitting what is applied", 0.75)
     return find_changes(revise(recalibrate_heat(selection)))
+
+
+def _told(begin: Model) -> dict[Coordinate, float]:
+    """Coordinates of what signals alone tell, where they say it is: what is refitted without it would make up for it, a
+    relaxation for a late angle."""
+    bench, known = begin.bench, {}
+    for effect in REGISTRY:
+        if effect.measure is None or not (channel := bench.channel_of(effect.channel)):
+            continue
+        own = begin.of_effect(effect.name) or effect_coordinates(bench.calibration, effect, channel, bench.reach).values()
+        known |= {c: bench.told[c.name] for c in own if c.name in bench.told}
+    return known
+
+
+def _found(model: Model, amplitude: Coordinate) -> Candidate:
+    """An effect that the calibration lacks and signals alone have told, accepted until the whole is revised."""
+    [effect] = (effect for effect in REGISTRY if effect.name == amplitude.effect)
+    evidence = model.evidence_against({amplitude: 0.0})
+    chance, gain = min(1.0, evidence.p_value * len(REGISTRY)), model.rms(evidence.gain, amplitude.channel)
+    found = Candidate(effect, amplitude.channel, (amplitude,), evidence=evidence, accepted=True)
+    return replace(found, p_value=evidence.p_value, q_value=chance, gain=gain)
 
 
 def _anything_left(selection: Selection) -> bool:

@@ -80,6 +80,8 @@ HOOKS = {
 }  # fmt: skip
 
 
+#: Names that the functions composed of terms (`effects.paths`) use themselves.
+_TAKEN = {"e", "s", "value", "terms"}.union(*(hook.arguments for hook in HOOKS.values()))
 #: Units in which the catalogue's bounds are those of a brake's motor. Other machines are of any size.
 OF_THE_MOTOR = ("A", "N·m", "N·m·s/rad", "1/A²")
 
@@ -170,6 +172,8 @@ class Effect:
         harmonic: how its shape is searched, if it is a harmonic of the motor angle.
         beside: effect of which it is an additional element, and without which it is not tried.
         bare: whether it is tried only on an actuator that clamps nothing.
+        measure: (SAMPLE rows of a log) → the amplitude and its standard deviation as signals alone tell them, without a model
+            of the brake. A search begins from there: from nothing no line leads to what is many samples away.
     """
 
     name: str
@@ -185,10 +189,13 @@ class Effect:
     harmonic: Harmonic | None = None
     beside: str = ""
     bare: bool = False
+    measure: Callable[[np.ndarray], tuple[float, float]] | None = None
 
     def __post_init__(self) -> None:
         if self.hook not in HOOKS:
             raise ValueError(f"effect {self.name}: there is no hook {self.hook}; there are {', '.join(HOOKS)}")
+        if self.name in _TAKEN:
+            raise ValueError(f"effect {self.name}: expected another name, which no argument of a hook has")
         offered = {"p", "value", *HOOKS[self.hook].arguments} | ({"s"} if self.state is not None else set())
         offered |= {"signals"} if self.hook in PORTS else set()
         if unknown := set(self.arguments) - offered:

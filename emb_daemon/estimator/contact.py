@@ -64,9 +64,9 @@ _CLAMPED = 0.1
 
 
 @njit
-def follow_zero(s: Record, p: Record, m: Record) -> bool:
-    """Whether the resolver's zero has moved, because its angle changed without a motion by the speed; the contact angle is
-    moved with it.
+def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
+    """Whether the resolver's zero has moved, because its angle changed without a motion by the speed, which has ``turned`` rad
+    since the last sample; the contact angle is moved with it.
 
     The shift follows from the speed. If the resolver had been frozen the motor may have turned meanwhile, and an impossible
     motion may have any cause; then the contact angle becomes uncertain by as much. A resolver that loses counts loses a few in
@@ -79,7 +79,6 @@ def follow_zero(s: Record, p: Record, m: Record) -> bool:
     reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
     moved, sigma = 0.0, 0.0
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
-    turned = 0.5 * (m.speed + s.speed) * m.dt
     slip = jump - turned
     # A speed that was late is as far off as one that went through the filter that is undone in its place.
     unsure = (_SLIP_DELAY_S + s.lateness.filtered) * abs(m.speed - s.speed) + SLIP_RAD

@@ -49,7 +49,7 @@ from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
-from emb_daemon.models.lateness import find_filter, follow, interrupt, stand, unfilter
+from emb_daemon.models.lateness import find_filter, follow, interrupt, stand, unfilter, way_beside
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, believe_resolver, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
@@ -139,10 +139,12 @@ def _advance(s, p, m, angle, speed, out):
     """`step` with current and motion of one moment; ``angle`` and ``speed`` as they came."""
     if not s.started:
         _start(s, p, m)
-    moved_zero = follow_zero(s, p, m)
+    turned = way_beside(s.lately, m.angle - s.angle, m.speed, s.speed, effects.known_delay(p.effects), m.dt)
+    moved_zero = follow_zero(s, p, m, turned)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
-        watch(s.plausibility, m, s.angle, s.speed, s.past_contact, sqrt(s.covariance[CONTACT, CONTACT]), s.contact.confirmed)
-    other_speed = _follow_age(s, p, m, moved_zero)
+        sigma = sqrt(s.covariance[CONTACT, CONTACT])
+        watch(s.plausibility, m, s.angle, s.speed, turned, s.past_contact, sigma, s.contact.confirmed)
+    other_speed = _follow_age(s, p, m, turned, moved_zero)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
     knew = s.temperature_known
@@ -194,9 +196,9 @@ def _advance(s, p, m, angle, speed, out):
 
 
 @njit
-def _follow_age(s, p, m, moved_zero):
+def _follow_age(s, p, m, turned, moved_zero):
     """Age of the angle beyond the calibration's, and whether its zero wanders; whether the speed is another from now on."""
-    travel, turned, gained = m.angle - s.angle, 0.5 * (m.speed + s.speed) * m.dt, m.speed - s.speed
+    travel, gained = m.angle - s.angle, m.speed - s.speed
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero and s.drifting_s == 0.0
     if seen and s.plausibility.verdict != STIFFNESS_WRONG:
         watch_wander(s.wander, travel, turned, m.speed, gained, s.speed_sigma, m.dt)
@@ -208,7 +210,7 @@ def _follow_age(s, p, m, moved_zero):
         interrupt(s.lateness)
         return False
     follow(s.lateness, travel, turned, gained, s.speed_sigma, m.dt)
-    s.late = max(s.lateness.age - effects.known_delay(p.effects), 0.0) if p.clearance_sigma > 0.0 else 0.0
+    s.late = s.lateness.age if p.clearance_sigma > 0.0 else 0.0
     if p.clearance_sigma == 0.0 or not find_filter(s.lateness):
         return False
     # The way so far was beside another speed, and what it told of the brake is wrong.

@@ -97,6 +97,21 @@ def turned_within(w: Record, age: float) -> float:
 
 
 @njit
+def way_beside(w: Record, travel: float, speed: float, before: float, age: float, dt: float) -> float:
+    """Way (rad) in ``dt`` s that a ``travel`` rad of the angle is held against: by ``speed`` rad/s and the one ``before``, or
+    by the speeds ``age`` s ago, of which LATELY ``w`` holds all but the newest, if the angle is known to be so late.
+
+    The nearer one: what made the angle late may have made the speed so, too."""
+    now = 0.5 * (speed + before) * dt
+    if age <= 0.0 or dt <= 0.0:
+        return now
+    since = max(dt - age, 0.0)
+    then = turned_within(w, age) - turned_within(w, max(age - dt, 0.0))
+    then += since * (before + 0.5 * (speed - before) * since / dt)
+    return then if abs(travel - then) < abs(travel - now) else now
+
+
+@njit
 def unfilter(a: Record, m: Record) -> None:
     """Replace the speed of SAMPLE ``m`` by what went into its filter, without its offset."""
     reported = m.speed

@@ -85,14 +85,15 @@ _AVERAGED_S = 0.04
 
 @njit
 def watch(
-    c: Record, m: Record, angle_before: float, speed_before: float, past_contact: float, contact_sigma: float, confirmed: bool
-) -> int:
+    c: Record, m: Record, angle_before: float, speed_before: float, turned: float, past_contact: float, contact_sigma: float,
+    confirmed: bool,
+) -> int:  # fmt: skip
     """Judge one sample that came within a cycle of the last, before it is fused; ``c.contradiction`` is of those before.
 
     Args:
         c: PLAUSIBILITY record.
         m: SAMPLE record.
-        angle_before, speed_before: rad and rad/s of the last sample.
+        angle_before, speed_before: rad and rad/s of the last sample; turned: rad since then by the speed.
         past_contact, contact_sigma: rad past the believed contact angle, and its standard deviation.
         confirmed: whether the contact angle has been seen to be right. Until then `models.contact` has the first word.
 
@@ -100,7 +101,7 @@ def watch(
         The verdict, also kept in ``c.verdict``.
     """
     travel = m.angle - angle_before
-    step = travel - 0.5 * (m.speed + speed_before) * m.dt
+    step = travel - turned
     delay = _DELAY_S * abs(m.speed)
     c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
     if abs(step) > _ALIKE_RAD + delay:
