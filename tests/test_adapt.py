@@ -795,8 +795,8 @@ def test_a_torque_that_is_off_for_a_while_teaches_no_other_pads(ideal):
 
 @pytest.fixture(scope="module")
 def acceptable():
-    """(TRAINING rows, calibration) of a training that is accepted with the usual limits. These are of the result, so that
-    all tests can have the same fit."""
+    """A training that is accepted with the usual limits, as a function of others. These are of the result, so that all
+    tests can have the same fit."""
     one_curve = msgspec.structs.replace(believed().stiffness, curves=believed().stiffness.curves[3:4])
     base = msgspec.structs.replace(believed(), stiffness=one_curve)
     rows, fitted, search = trained_rows(to_parameters(IDEAL)), [], fit_module._fit_with_and_without_curve
@@ -806,10 +806,13 @@ def acceptable():
             fitted.append(search(*arguments))
         return fitted[0]
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_module, "_fit_with_and_without_curve", once)
-        assert fit(rows, base).outcome == r.ACCEPTED
-        yield rows, base
+    def limited(limits):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(fit_module, "_fit_with_and_without_curve", once)
+            return fit(rows, msgspec.structs.replace(base, adaptation=msgspec.structs.replace(base.adaptation, **limits)))
+
+    assert limited({}).outcome == r.ACCEPTED
+    return limited
 
 
 @pytest.mark.parametrize(
@@ -825,9 +828,7 @@ def acceptable():
     ],
 )
 def test_each_limit_of_the_evaluation_refuses(acceptable, limit, value, outcome, note):
-    rows, base = acceptable
-    limits = msgspec.structs.replace(base.adaptation, **{limit: value})
-    found = fit(rows, msgspec.structs.replace(base, adaptation=limits))
+    found = acceptable({limit: value})
     assert found.outcome == outcome and note in found.note
 
 

@@ -18,8 +18,6 @@ can explain the same torque by a torque constant or a friction within their prio
 fused force does not follow a drift. Its difference from the fused force counts in the standard deviation by its odds, and so
 does unobserved growth of its disc: a drag heats a disc by tens of kelvin in seconds and hardly moves the motor. Evidence for
 it is remembered, because a first hypothesis that has attributed the pads' change to motor and friction contradicts it no more.
-Where a release leaves clearly more evidence for it than for any jump, it becomes the first, and goes on drifting; and no jump
-of the torque is believed for which there is less.
 """
 
 from math import exp, log, sqrt
@@ -36,7 +34,6 @@ from emb_daemon.estimator.unknown import (
     add_growth,
     add_stiffness_jumps,
     add_torque_jumps,
-    drift_walk,
     stay_possible,
 )
 from emb_daemon.jit import Floats, Record, njit, sq
@@ -108,7 +105,8 @@ _SURELY = 9.0
 #: slowly.
 GATE = 5.0
 
-#: What may have changed at once, or shows with heat and time, a jump that was opened before, and a brake that drifts.
+#: What may have changed at once, or shows with heat and time, a jump that was opened before, and a brake that drifts, which
+#: never becomes the first hypothesis.
 ALTERNATIVES = 5
 STIFFNESS_JUMP, TORQUE_JUMP, SLOW_CHANGE, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 
@@ -263,7 +261,7 @@ def _become_first(s, a):
     s.force += shift
     s.drive += shift
     kept = s.alternatives[KEPT_JUMP]
-    other = s.alternatives[TORQUE_JUMP if kind in (STIFFNESS_JUMP, DRIFT) else STIFFNESS_JUMP]
+    other = s.alternatives[TORQUE_JUMP if kind == STIFFNESS_JUMP else STIFFNESS_JUMP]
     if kept.kind == kind or kept.log_odds < other.log_odds:
         _keep(s, other)
     kept.log_odds -= odds
@@ -289,21 +287,6 @@ def _strongest(s, but):
         if s.alternatives[i].kind != but:
             best = max(best, s.alternatives[i].log_odds)
     return best
-
-
-@njit
-def _evidence(a):
-    """What speaks for an alternative beyond its prior, log odds."""
-    return a.log_odds - a.prior
-
-
-@njit
-def _most_evidence(s):
-    """Most evidence for any change but a drift, log odds."""
-    most = 0.0
-    for kind in range(DRIFT):
-        most = max(most, _evidence(s.alternatives[kind]))
-    return most
 
 
 @njit
@@ -346,7 +329,7 @@ def likely_shift(s: Record) -> float:
 @njit
 def _speaks(a):
     """Whether there is evidence for an alternative, beyond its prior."""
-    return _evidence(a) > _SUSPECTED
+    return a.log_odds > a.prior + _SUSPECTED
 
 
 @njit
@@ -492,28 +475,6 @@ def _follow_contact(s):
 
 
 @njit
-def _take_proven(s, p):
-    """Make a proven change the first hypothesis at a release; whether there was one."""
-    a, drift = _likeliest(s), s.alternatives[DRIFT]
-    # Expected changes need as much evidence as others, because otherwise one false jump would lead to the next.
-    enough, drifts = PROVEN - PRIOR_ODDS, _evidence(drift) - _most_evidence(s)
-    if _evidence(drift) > enough and drifts >= _CLEARLY:
-        _become_first(s, drift)
-        # It goes on drifting.
-        s.contact_walk = max(s.contact_walk, drift_walk(p, True, False))
-        return True
-    margin = _CLEARLY if a.age_s < _AMBIGUOUS_S else 0.0
-    # Friction of any speed and load can imitate contact and stiffness that drift, in a jump of the torque that never was.
-    imitates = a.kind == TORQUE_JUMP and drifts > 0.0
-    if imitates or _evidence(a) <= enough or a.log_odds <= PROVEN or a.log_odds - _strongest(s, a.kind) < margin:
-        return False
-    if a.kind == STIFFNESS_JUMP:
-        s.jumps += 1.0
-    _become_first(s, a)
-    return True
-
-
-@njit
 def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     """Prove or reopen. Returns whether an alternative became the first hypothesis.
 
@@ -529,7 +490,14 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
         s.stops += 1.0
     for i in range(0 if released else DRIFT):
         s.alternatives[i].age_s += dt
-    if released and _take_proven(s, p):
+    a = _likeliest(s)
+    margin = _CLEARLY if a.age_s < _AMBIGUOUS_S else 0.0
+    # Expected jumps need as much evidence as others, because otherwise one false jump would lead to the next.
+    evidence = a.log_odds - a.prior > PROVEN - PRIOR_ODDS
+    if released and evidence and a.log_odds > PROVEN and a.log_odds - _strongest(s, a.kind) >= margin:
+        if a.kind == STIFFNESS_JUMP:
+            s.jumps += 1.0
+        _become_first(s, a)
         return True
     stiffness, torque, kept = s.alternatives[STIFFNESS_JUMP], s.alternatives[TORQUE_JUMP], s.alternatives[KEPT_JUMP]
     undecided = released and _strongest(s, DRIFT) < PROVEN

@@ -257,17 +257,11 @@ def add_drift(P: Floats, p: Record) -> None:
 
 
 @njit
-def drift_walk(p: Record, turning: bool, proven: bool) -> float:
-    """Variance, rad^2/s, that such a brake's contact angle gains beside `set_walks`; ``turning``: the disc; ``proven``: it is
-    such a brake beyond doubt."""
-    walk = _PROVEN_WALK_M_PER_SQRT_S if proven else _DRIFT_WALK_M_PER_SQRT_S
-    return sq(walk / p.gear_gain * (1.0 if turning else _DRIFT_STANDING))
-
-
-@njit
 def add_drift_walks(walked: Floats, p: Record, turning: bool, proven: bool, dt: float) -> None:
-    """Variance that such a brake's contact and stiffness gain in ``dt`` s beside `set_walks`; as in `drift_walk`."""
-    walked[CONTACT] += drift_walk(p, turning, proven) * dt
+    """Variance that such a brake's contact and stiffness gain in ``dt`` s beside `set_walks`; ``turning``: the disc;
+    ``proven``: it is such a brake beyond doubt."""
+    walk = _PROVEN_WALK_M_PER_SQRT_S if proven else _DRIFT_WALK_M_PER_SQRT_S
+    walked[CONTACT] += sq(walk / p.gear_gain * (1.0 if turning else _DRIFT_STANDING)) * dt
     walked[SCALE] += sq(_DRIFT_SCALE_WALK_PER_SQRT_S) * dt
 
 
