@@ -196,6 +196,15 @@ def test_pads_that_have_moved_are_where_the_training_stroke_found_them():
     assert np.abs(estimates["force"] - force_N)[after].max() < 1500.0
 
 
+def test_sigma_follows_a_contact_that_moves_while_the_motor_holds():
+    """By 127 um in 25 s: angle and torque can each be at fault, and the force is 4 kN off."""
+    _, moments, estimates, force_N = drive(("contact_slow",), 1, 61)
+    time_s = 1e-9 * estimates["time_ns"] - moments["park"]
+    held = (time_s > 5.0) & (time_s < 30.0)
+    off = np.abs(estimates["force"] - force_N)[held]
+    assert off.max() > 4000.0 and np.max(off / estimates["sigma"][held]) < 3.5
+
+
 def test_another_brake_has_its_share_of_forces_and_of_sizes(plant):
     own, half = (draw_drive(plant, np.random.default_rng(1), share=share) for share in (1.0, 0.5))
     forces = own[0].commands["mode"] == FORCE

@@ -554,6 +554,7 @@ def applied(kept, moved=0.02, sigma=0.03):
     reached["contact_angle"], reached["past_contact"], reached["force"] = 8.0 + moved, 2.0 - moved, 900.0
     a["contact_angle"], a["contact_sigma"], a["torque_error"], a["torque_error_sigma"] = 8.0 + moved, sigma, 0.04, 0.01
     a["inertia_error"], a["inertia_sigma"] = 0.05, 0.02
+    a["fade"], a["housing_fade"] = -0.3, 0.1
     before = state.copy()
     training.apply_learned(state, p, reached, np.zeros(0, r.TRAINING), learned, a)
     return before, state, a, learned
@@ -602,12 +603,13 @@ def test_a_curve_that_did_not_change_leaves_what_driving_knew():
 
 
 def test_a_new_curve_is_known_as_the_stroke_knows_it():
-    """Torque constant and inertia with it, at the motor's heat of now; a brake that drifts begins anew."""
+    """Torque constant and inertia with it, beside what was known of the motor's heat; a brake that drifts begins anew."""
     before, state, _, learned = applied(kept=False)
     x, P = state["error"], state["covariance"]
     assert state["contact_angle"] == state["contact_anchor"] == 8.02 and P[CONTACT, CONTACT] == pytest.approx(9e-4)
-    faded = before["error"][FADE] * 0.3 + before["error"][HOUSING] * 0.2
-    assert (x[GAIN], x[INERTIA]) == pytest.approx((-0.04 - faded, 0.05))
+    faded = x[GAIN] + x[FADE] * 0.3 + x[HOUSING] * 0.2
+    assert (faded, x[INERTIA]) == pytest.approx((-0.04 - 0.3 * 0.3 + 0.1 * 0.2, 0.05))
+    assert x[FADE] == before["error"][FADE] and x[HOUSING] == before["error"][HOUSING]
     assert (P[GAIN, GAIN], P[INERTIA, INERTIA]) == pytest.approx((1e-4, 4e-4))
     assert not np.delete(P[GAIN], GAIN).any() and not np.delete(P[:, INERTIA], INERTIA).any()
     assert P[SCALE, SCALE] == learned["stiffness_relative_sigma"] ** 2 and state["scale"] == 1.0

@@ -31,15 +31,7 @@ from emb_daemon.adapt.learned import (
     curve_values,
     why_out_of_bounds,
 )
-from emb_daemon.adapt.pairs import (
-    FORCE,
-    MODEL,
-    WEIGHT,
-    curve_from_pairs,
-    friction_from_pairs,
-    pairs_of_passes,
-    turned_angles,
-)
+from emb_daemon.adapt.pairs import FORCE, MODEL, WEIGHT, curve_from_pairs, friction_from_pairs, pairs_of_passes, turned_angles
 from emb_daemon.calibration.parameters import (
     INERTIA,
     LOAD_FRICTION,

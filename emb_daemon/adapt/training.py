@@ -199,9 +199,9 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     _reset_fitted(s.error, s.covariance)
     s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else sq(a.contact_sigma)
     if not kept:
-        # A new curve depends on the torque constant and the inertia of the stroke.
-        known = (a.fade - s.error[FADE]) * s.winding + (a.housing_fade - s.error[HOUSING]) * s.housing
-        _replace(s, GAIN, known - a.torque_error, a.torque_error_sigma)
+        # A new curve depends on the torque constant and the inertia of the stroke, and on how the motor had faded before it.
+        since = (s.error[FADE] - a.fade) * s.winding + (s.error[HOUSING] - a.housing_fade) * s.housing
+        _replace(s, GAIN, -a.torque_error - since, a.torque_error_sigma)
         _replace(s, INERTIA, a.inertia_error, a.inertia_sigma)
         # Driving may still correct what the stroke left uncertain of the new curve.
         s.covariance[SCALE, SCALE] = sq(learned.stiffness_relative_sigma)

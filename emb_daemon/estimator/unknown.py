@@ -82,10 +82,10 @@ _CONTACT_REACH_M, _SCALE_REACH, _CREEP_REACH, _GAIN_REACH = 100e-6, 0.3, 0.1, 0.
 #: it stands, m per root of a second; stiffness, which gains some 4 % with each millimetre that a lining wears, and its walk,
 #: shares.
 _DRIFT_CONTACT_M, _DRIFT_WALK_M_PER_SQRT_S, _DRIFT_STANDING = 10e-6, 3e-6, 0.3
-#: The same walk of a brake that has been found to drift: a disc that one stop heats by 300 K grows by 80 um within a minute.
-#: With less, its contact angle lags behind what moves it, and sigma with it.
-_PROVEN_WALK_M_PER_SQRT_S = 10e-6
 DRIFT_SCALE, _DRIFT_SCALE_WALK_PER_SQRT_S, _DRIFT_CREEP = 0.05, 0.02 / 60.0, 0.01
+#: The contact angle's walk once the brake is certainly no more what it was: a disc that one stop heats by 300 K grows by 80 um
+#: (`_GROWTH_JUMP_M_PER_K`) within a minute. With less, a drift lags behind what moves the contact, and sigma with it.
+_CHANGED_WALK_M_PER_SQRT_S = 10e-6
 #: Bounds of what can be learned: beyond them it is a fault.
 LEAST_SCALE, MOST_SCALE, MOST_CREEP = 0.3, 3.0, 0.5
 
@@ -257,10 +257,10 @@ def add_drift(P: Floats, p: Record) -> None:
 
 
 @njit
-def add_drift_walks(walked: Floats, p: Record, turning: bool, proven: bool, dt: float) -> None:
+def add_drift_walks(walked: Floats, p: Record, turning: bool, changed: bool, dt: float) -> None:
     """Variance that such a brake's contact and stiffness gain in ``dt`` s beside `set_walks`; ``turning``: the disc;
-    ``proven``: it is such a brake beyond doubt."""
-    walk = _PROVEN_WALK_M_PER_SQRT_S if proven else _DRIFT_WALK_M_PER_SQRT_S
+    ``changed``: the brake is certainly no more what it was, by a drift or something else."""
+    walk = _CHANGED_WALK_M_PER_SQRT_S if changed else _DRIFT_WALK_M_PER_SQRT_S
     walked[CONTACT] += sq(walk / p.gear_gain * (1.0 if turning else _DRIFT_STANDING)) * dt
     walked[SCALE] += sq(_DRIFT_SCALE_WALK_PER_SQRT_S) * dt
 

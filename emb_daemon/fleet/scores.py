@@ -82,8 +82,7 @@ def is_periodic(effect: Effect) -> bool:
 
 
 class _Bench(Bench):
-    """One drive. Its parameters differ from those of other drives in the contact angle only, so that they are made once:
-    a fifth of a score's time."""
+    """One drive. Its parameters differ from those of other drives in the contact angle only, so that they are made once."""
 
     def __init__(self, log: Log, calibration: Calibration, contact: Coordinate, made: dict[tuple, np.void]):
         super().__init__([log], calibration, workers=1)
