@@ -196,9 +196,10 @@ def _value(q, t, k, dt, maximum_force):
 
 @njit
 def _sigma_outside(q, signal, added, speed_error):
-    """Standard deviation in the port's unit where a term leaves its range: that of the coefficient, and the term's own size
+    """Standard deviation in the port's unit where a term leaves its range: that of the coefficient and the term's own size,
     times the distance of its signals from their range, in widths of the range; all that the term can be if a signal is not
-    known. ``speed_error``: standard deviation of the disc's speed, as a share of it."""
+    known. At the edge of the range the term is as certain as within. ``speed_error``: standard deviation of the disc's speed,
+    as a share of it."""
     x = signal[q.signal]
     gate_known = not (q.gate == _TURNING or q.gate == _STANDING) or np.isfinite(signal[_WHEEL])
     if not (gate_known and np.isfinite(x) and (q.other < 0 or np.isfinite(signal[q.other]))):
@@ -208,9 +209,7 @@ def _sigma_outside(q, signal, added, speed_error):
         outside += max(_of_other(q, signal) - 1.0, 0.0)
     if speed_error > 0.0 and (q.signal == _WHEEL or q.other == _WHEEL):
         outside += speed_error * (q.exponent if q.signal == _WHEEL and q.shape in (_ODD, _EVEN) else 1.0)
-    if not outside > 0.0:
-        return 0.0
-    return hypot(q.sigma, outside * max(abs(added), q.sigma))
+    return outside * hypot(q.sigma, added)
 
 
 @njit

@@ -49,7 +49,7 @@ def follow_straying(s: Record, travel: float, speed: float, dt: float) -> None:
     a.speed += (1.0 - exp(-dt / _SMOOTHED_S)) * (speed - a.speed)
     noise = s.speed_sigma * sqrt(0.5 * dt / _SMOOTHED_S)
     # An angle that strays while the speed shows nothing does not slide the gear: what friction carries at rest stays unknown.
-    a.creeps = w.drift != 0.0 and abs(a.speed) < OFFSET_RAD_PER_S + _NOISE * noise
+    a.creeps = abs(a.speed) < OFFSET_RAD_PER_S + _NOISE * noise
 
 
 @njit

@@ -4,14 +4,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import CLEARANCE, value_of
-from emb_daemon.calibration.types import Calibration
+from emb_daemon.calibration.parameters import CLEARANCE, moved, value_of
+from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.dynamics import Errors, Pads, fit_dynamics, path_errors
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import Log
+from emb_daemon.offline.run import held, run_step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,10 +36,10 @@ class Fold(Step):
     def under(self, calibration: Calibration) -> "Fold":
         """The same with the errors of another calibration, which has these pads."""
         found = replace(self.torque, values={key: value_of(calibration, key) for key in KEYS})
-        clearance = value_of(calibration, CLEARANCE)
+        there = held(to_parameters(moved(calibration, {"pad_thickness_mm": self.pads.thickness_mm})))
         return replace(
             self,
-            errors=[path_errors(log, calibration, self.pads.thickness_mm, clearance) for log in self.held_out],
+            errors=[_errors(log, there) for log in self.held_out],
             unexplained=[unexplained_current(log, found, calibration) for log in self.held_out],
         )
 
@@ -65,3 +66,10 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
         errors=[path_errors(log, own.calibration, pads.thickness_mm, clearance) for log in pads.random],
         unexplained=[unexplained_current(log, torque, joint.calibration) for log in pads.random],
     )
+
+
+def _errors(log: Log, parameters: np.ndarray) -> Errors:
+    """Errors of the stiffness path in the whole step: what follows heat acts on cold pads too, and needs their temperature."""
+    error = run_step(log.samples, parameters)["force"] - log.force_N
+    known = np.isfinite(error)
+    return error[known], log.force_N[known]
