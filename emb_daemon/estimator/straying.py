@@ -26,8 +26,8 @@ STRAYING = np.dtype([*fields("f8", "share told strayed contact known gained walk
 _OPEN = 1.0 / 0.5**2
 #: What of the evidence is kept from stop to stop: an offset of the speed is joined by a drift of the angle within minutes.
 _KEPT = 0.9
-#: Time over which the speed is smoothed, s; of a motor that stands it then is the speed's offset and so many standard
-#: deviations of its noise.
+#: Time over which the speed is smoothed, s; of a motor that stands it is at most the speed's offset and so many standard
+#: deviations of its noise, then as now.
 _SMOOTHED_S, _NOISE = 0.2, 3.0
 
 
@@ -48,8 +48,9 @@ def follow_straying(s: Record, travel: float, speed: float, dt: float) -> None:
     w.unseen = 0.0
     a.speed += (1.0 - exp(-dt / _SMOOTHED_S)) * (speed - a.speed)
     noise = s.speed_sigma * sqrt(0.5 * dt / _SMOOTHED_S)
-    # An angle that strays while the speed shows nothing does not slide the gear: what friction carries at rest stays unknown.
-    a.creeps = abs(a.speed) < OFFSET_RAD_PER_S + _NOISE * noise
+    # An angle that moves while the speed, now and of late, shows nothing may stray: it does not slide the gear, and what
+    # friction carries at rest stays unknown.
+    a.creeps = max(abs(a.speed) - _NOISE * noise, abs(speed) - _NOISE * s.speed_sigma) < OFFSET_RAD_PER_S
 
 
 @njit
