@@ -96,6 +96,12 @@ def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, 
     return Trial(log, index, force, cut, rows, measured, torque, stands, slides, mounted)
 
 
+def count_over(episodes: Sequence[np.ndarray]) -> np.ndarray:
+    """Numbers of episodes of several logs, each counted from 0, counted over all."""
+    before = np.cumsum([0] + [int(own[-1]) + 1 for own in episodes])
+    return np.concatenate([own + first for own, first in zip(episodes, before, strict=False)])
+
+
 def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
     """Reference force (N) and brake torque (N m) at the samples; NaN where there is none.
 
@@ -233,8 +239,7 @@ class Bench:
     @cached_property
     def sample_episode(self) -> np.ndarray:
         """Episode of every sample, counted over all logs."""
-        counts = [int(trial.episode[-1]) + 1 for trial in self.trials]
-        return np.concatenate([t.episode + before for t, before in zip(self.trials, np.cumsum([0, *counts]), strict=False)])
+        return count_over([trial.episode for trial in self.trials])
 
     @cached_property
     def episodes(self) -> int:
