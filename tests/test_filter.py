@@ -60,11 +60,15 @@ def test_steady_state_solves_the_riccati_equation():
     np.testing.assert_allclose(predicted[np.ix_(seen, seen)], expected, rtol=1e-6)
 
 
+#: Of a brake of which nothing is known yet; to read.
+_NEW = new_state()[0]
+
+
 def _sensitivities(p, force, slope, speed, accelerating, motor_torque, friction_mean, warmth, heats):
     """Sensitivity of force and of the torque left unexplained, as `fuse` forms them."""
     to_f, to_t = np.zeros(STATES), np.zeros(STATES)
     leverage = p["gear_gain"] + p["load_friction"] * friction_mean
-    to_force(to_f, new_state()[0], p["stiffness_sigma"] + p["stiffness_relative_sigma"] * force, slope, force, warmth)
+    to_force(to_f, _NEW, p["stiffness_sigma"] + p["stiffness_relative_sigma"] * force, slope, force, warmth)
     to_t[:] = to_f
     slow = friction_mean * np.exp(-abs(speed) / 10.0)
     to_torque(to_t, leverage, 1.0, friction_mean, force, speed, slow, accelerating, motor_torque, *heats)

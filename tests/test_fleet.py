@@ -18,6 +18,7 @@ import pytest
 from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.cli.main import main
+from emb_daemon.diagnose import residuals
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.fleet import dataset, findings, learning, population, scores
 from emb_daemon.fleet.cluster import cluster, run
@@ -683,6 +684,13 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
     still = replace(log, samples=log.samples[:100], time_ns=log.time_ns[:100])
     with pytest.raises(InputError, match=r"the pads never touch|no brake application"):
         scores.Scorer(calibration).score(still, drive)
+
+
+def test_a_drive_is_not_cut_into_episodes_that_nobody_asks_for(fleet, calibration, monkeypatch):
+    """The whole step would be run once more."""
+    drive = dataset.drives(fleet[0])[0]
+    monkeypatch.setattr(residuals, "make_trial", lambda *_: pytest.fail("it was cut"))
+    assert scores.Scorer(calibration).score(dataset.read_drive(fleet[0], drive)[0], drive).loaded > 0
 
 
 def test_a_training_is_learned_once(tmp_path, calibration, monkeypatch):

@@ -137,18 +137,24 @@ def test_the_same_sources_in_another_place_are_not_compiled_again(tmp_path):
         assert done.stdout == said + "\n", done.stderr
 
 
-def test_compiled_code_goes_where_it_is_told(tmp_path):
-    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory) -> Path:
+    """A folder that holds what a process compiled."""
+    folder = tmp_path_factory.mktemp("kept") / "cache"
+    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(folder))
     assert done.returncode == 0 and not done.stderr
-    assert Path(done.stdout.strip()).parent == tmp_path / "cache"
-    assert list((tmp_path / "cache").rglob("*.nbi")), "nothing was kept"
+    assert Path(done.stdout.strip()).parent == folder
+    return folder
+
+
+def test_compiled_code_goes_where_it_is_told(kept):
+    assert list(kept.rglob("*.nbi")), "nothing was kept"
 
 
 @pytest.mark.parametrize("below", [True, False])
-def test_a_folder_that_anybody_can_write_to_is_not_loaded_from(tmp_path, below):
+def test_a_folder_that_anybody_can_write_to_is_not_loaded_from(tmp_path, kept, below):
     """What is found there is executed."""
-    done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
-    folder = Path(done.stdout.strip())
+    [folder] = shutil.copytree(kept, tmp_path / "cache").iterdir()
     (folder if below else folder.parent).chmod(0o777)
     for file in folder.rglob("*.nb?"):
         file.write_bytes(b"not what was compiled")

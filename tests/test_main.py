@@ -9,6 +9,10 @@ import pytest
 from emb_daemon.cli import check
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, Unavailable
+from emb_daemon.logs.candump import format_candump
+from emb_daemon.logs.read import read_frames
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import rest, simulate_log
 from emb_daemon.resources import resource
 
 
@@ -101,3 +105,17 @@ def test_a_number_or_a_folder_that_cannot_be_is_refused_in_one_line(tmp_path, ca
     names = {"tmp": tmp_path, "config": resource("config/emb.yaml")}
     assert main(arguments.format(**names).split()) == 2
     assert capsys.readouterr().err.startswith(line.format(**names))
+
+
+def test_a_command_imports_no_reader_that_another_process_has_but_writes_its_format(tmp_path, calibration):
+    pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    frames, _ = simulate_log(plant_from_calibration(calibration), rest(0.4), reference=False)
+    (tmp_path / "a.log").write_text(format_candump(frames))
+    code = (
+        "import sys; from emb_daemon.cli.main import main;"
+        "assert main() == 0; assert 'can' in sys.modules and 'asammdf' not in sys.modules;"
+        "sys.argv[-1] = sys.argv[-1].replace('.log', '.mf4'); assert main() == 0"
+    )
+    done = processkit.python("-c", code, "replay", tmp_path / "a.log", "--output", tmp_path / "sent.log")
+    assert done.returncode == 0, done.stderr
+    assert len(read_frames(tmp_path / "sent.mf4")) == len(read_frames(tmp_path / "sent.log")) > 0

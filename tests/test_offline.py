@@ -208,6 +208,18 @@ def test_an_rmse_is_computed_in_one_module():
     assert found == {"emb_daemon/offline/score.py"}
 
 
+def test_a_fit_asks_nothing_twice():
+    """Its time is that of residuals."""
+    asked, data = [], np.exp(0.7) + np.zeros(50)
+
+    def residual(v):
+        asked.append(v["a"])
+        return np.exp(v["a"]) - data
+
+    fit([Block(residual, ("a",), np.arange(50))], {"a": Free(0.0, 1e-6)})
+    assert len(asked) > 6 and len(set(asked)) == len(asked)
+
+
 def test_blocks_of_a_fit_run_side_by_side_to_the_same_values():
     """Two cores: the residuals of one log wait for those of the other, which would never come one after the other."""
     both = threading.Barrier(2, timeout=30.0)

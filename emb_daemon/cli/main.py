@@ -60,12 +60,15 @@ def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 on success, 2 for wrong usage or unusable input, 1 if something that it needs
     is missing now."""
-    argv = sys.argv[1:] if argv is None else argv
+    own_process, argv = argv is None, sys.argv[1:] if argv is None else argv
     for stream in (sys.stdout, sys.stderr):
         # Characters that the terminal's encoding lacks are replaced; they must not end the program.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     command = _parser(COMMANDS).parse_known_args(argv[:1])[0].command
+    if own_process and command not in _WITHOUT_NUMBA:
+        # Elsewhere python-can may be wanted for MDF4 by who calls.
+        importlib.import_module("emb_daemon.wire.light_can")
     module = importlib.import_module(f"emb_daemon.cli.{command}")
     parser = argparse.ArgumentParser(
         prog=f"emb-daemon {command}",

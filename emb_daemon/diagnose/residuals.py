@@ -96,6 +96,12 @@ def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, 
     return Trial(log, index, force, cut, rows, measured, torque, stands, slides, mounted)
 
 
+def count_over(episodes: Sequence[np.ndarray]) -> np.ndarray:
+    """Numbers of episodes of several logs, each counted from 0, counted over all."""
+    before = np.cumsum([0] + [int(own[-1]) + 1 for own in episodes])
+    return np.concatenate([own + first for own, first in zip(episodes, before, strict=False)])
+
+
 def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
     """Reference force (N) and brake torque (N m) at the samples; NaN where there is none.
 
@@ -189,7 +195,6 @@ class Bench:
     Attributes:
         channels: those that these logs can judge.
         straight: whether heat answers so nearly in proportion that one derivative serves all iterations of a fit.
-        episode: by channel, the episode number of every residual, shape (N,), counted over all logs.
         middle: of the motor angles that occur, rad; harmonics are fitted about it.
     """
 
@@ -212,10 +217,7 @@ class Bench:
         #: By key of the calibration, what signals alone tell of effects, where that is far from what it says.
         self.told: dict[str, float] = _told_by_signals(logs, calibration)
 
-        def trial(index: int, log: Log, here: Mapping[str, float]) -> Trial:
-            return make_trial(log, index, held(to_parameters(moved(calibration, {**here, **self.told})))[0], here)
-
-        self.trials: list[Trial] = list(self.map(trial, range(len(logs)), logs, mounted))
+        self.trials: list[Trial] = list(self.map(self._trial, range(len(logs)), logs, mounted))
         self.has_reference: bool = all(trial.has_force for trial in self.trials)
         self.clamps: bool = calibration.contact.is_in_reach
         self.has_current: bool = any(trial.log.samples["has_current"].any() for trial in self.trials)
@@ -230,15 +232,26 @@ class Bench:
         self.turns_free: bool = self.has_reference and not self.clamps and not np.any(self.load_N)
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere: float = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
-        offsets = np.cumsum([0] + [int(trial.episode[-1]) + 1 for trial in self.trials])
-        self.episodes: int = int(offsets[-1])
-        by_sample = [trial.episode + offset for trial, offset in zip(self.trials, offsets, strict=False)]
+
+    def _trial(self, index: int, log: Log, mounted: Mapping[str, float]) -> Trial:
+        return make_trial(log, index, held(to_parameters(moved(self.calibration, {**mounted, **self.told})))[0], mounted)
+
+    @cached_property
+    def sample_episode(self) -> np.ndarray:
+        """Episode of every sample, counted over all logs."""
+        return count_over([trial.episode for trial in self.trials])
+
+    @cached_property
+    def episodes(self) -> int:
+        """Their number."""
+        return int(self.sample_episode[-1]) + 1
+
+    @cached_property
+    def episode(self) -> dict[str, np.ndarray]:
+        """By channel, the episode number of every residual, shape (N,), counted over all logs."""
+        by_sample = self.by_log(self.sample_episode)
         by_temperature = [np.repeat(e[trial.temperature_rows], 9) for trial, e in zip(self.trials, by_sample, strict=True)]
-        self.sample_episode: np.ndarray = np.concatenate(by_sample)
-        self.episode: dict[str, np.ndarray] = {
-            channel: np.concatenate(by_temperature) if channel == "temperature" else self.sample_episode
-            for channel in self.channels
-        }
+        return {c: np.concatenate(by_temperature) if c == CHANNEL_OF_HEAT else self.sample_episode for c in self.channels}
 
     @cached_property
     def reach(self) -> dict[str, float]:
@@ -349,13 +362,17 @@ class Bench:
         """PARAMETERS of a log with coordinates at ``values``, `held`."""
         return held(to_parameters(self.calibrated(values, trial.index)))[0]
 
-    def _per_ampere(self, trial: Trial, parameters: np.void, heat: np.ndarray | None) -> np.ndarray | None:
+    def _per_ampere(
+        self, trial: Trial, parameters: np.void, heat: np.ndarray | None, now: np.ndarray | None = None
+    ) -> np.ndarray | None:
         """Torque (N m) of one ampere more at each sample of a run, where the constant itself follows the current: the noise of
-        that counts so much there, which least squares would reduce by a wrong exponent."""
+        that counts so much there, which least squares would reduce by a wrong exponent. ``now``: the run with the heat held,
+        if there was one."""
         if heat is None or not _follows_current(parameters["effects"]):
             return None
-        samples = trial.log.samples.copy()
-        now = run_held(samples, parameters, heat)
+        # Numpy would copy the records field by field, which takes ten times as long.
+        samples = np.frombuffer(bytearray(trial.log.samples), trial.log.samples.dtype)
+        now = run_held(samples, parameters, heat) if now is None else now
         samples["current_q"] += _MORE_A
         more = (run_held(samples, parameters, heat)["torque"] - now["torque"]) / _MORE_A
         return np.clip(more, 0.5 * now["torque_constant"], 2.0 * now["torque_constant"])
@@ -428,7 +445,7 @@ class Bench:
         for trial, known in zip(self.trials, heat, strict=True):
             samples, parameters = trial.log.samples, self.parameters_of(trial, values)
             trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
-            per_ampere = self._per_ampere(trial, parameters, known)
+            per_ampere = self._per_ampere(trial, parameters, known, trace)
             parts.append(self.residual_of(trial, trace, channel, per_ampere))
         return np.concatenate(parts)
 

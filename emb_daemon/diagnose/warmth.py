@@ -18,7 +18,7 @@ from emb_daemon.diagnose.coordinates import Coordinate, Values, base_coordinates
 from emb_daemon.diagnose.forms import FORMED, Form
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.prospects import CHANCES, SHIFTS, Scores, Screen, Search, covered_by, record_of
-from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench, count_over
 from emb_daemon.diagnose.screening import Rivals, Screening
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import PORTS, SIGNALS
@@ -60,10 +60,7 @@ class HeatBench(Bench):
         pairs = list(zip(recordings, self._every, strict=True))
         self._measured = [np.where(inside, r.measured[:, ::every].T, np.nan) for r, every in pairs]
         cut = [(r.time_s[::every] // _EPISODE_S).astype(int) for r, every in pairs]
-        offsets = np.cumsum([0] + [int(own[-1]) + 1 for own in cut])
-        self.episodes: int = int(offsets[-1])
-        episode = np.concatenate([own + offset for own, offset in zip(cut, offsets, strict=False)])
-        self.sample_episode: np.ndarray = np.repeat(episode, _PLACES)
+        self.sample_episode: np.ndarray = np.repeat(count_over(cut), _PLACES)
         self.episode: dict[str, np.ndarray] = {CHANNEL_OF_HEAT: self.sample_episode}
 
     @property

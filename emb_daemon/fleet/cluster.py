@@ -71,7 +71,7 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.ERROR,
-            preload=["emb_daemon.fleet.worker"],
+            preload=["emb_daemon.wire.light_can"],
         )
         try:
             with Client(local) as client:

@@ -7,7 +7,7 @@ from drive to drive and is eliminated at once.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -87,6 +87,11 @@ class _Bench(Bench):
     def __init__(self, log: Log, calibration: Calibration, contact: Coordinate, made: dict[tuple, np.void]):
         super().__init__([log], calibration, workers=1)
         self._contact, self._made = contact, made
+
+    def _trial(self, index: int, log: Log, mounted: Mapping[str, float]) -> Trial:
+        """Not cut into episodes, for which the whole step would be run once more: a drive is one opinion."""
+        nothing = np.zeros(0)
+        return Trial(log, index, log.force_N, nothing, nothing, nothing, nothing, nothing, nothing, mounted)
 
     def parameters_of(self, trial: Trial, values: Values) -> np.void:
         others = tuple((c.name, value) for c, value in values.items() if c is not self._contact)

@@ -1,6 +1,7 @@
 """Tables of estimates and logs of frames, by the output file's ending; a file is written completely or not at all."""
 
 import datetime
+import importlib
 import os
 import re
 import tempfile
@@ -126,6 +127,9 @@ def write_frames(path: Path, frames: np.ndarray) -> None:
         return write_atomically(path, format_candump(frames).encode())
     import can
 
+    if path.suffix.lower() == ".mf4":
+        # Commands have imported it without asammdf (`wire.light_can`).
+        importlib.reload(can.io.mf4)
     with name_in_errors(path), tempfile.TemporaryDirectory(dir=path.parent) as folder:
         # python-can takes everything after the first dot of a name for the format.
         part = Path(folder) / f"frames{path.suffix.lower()}"

@@ -8,7 +8,7 @@ million samples, most of it zeros, is never stored.
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
@@ -111,7 +111,7 @@ def fit(blocks: Sequence[Block], free: Mapping[Hashable, Free], *, tolerance: fl
         gtol=None,
         max_nfev=evaluations,
     )
-    residuals = problem.residuals(found.x)
+    residuals = problem.residuals(tuple(found.x))
     covariance, from_prior = problem.covariance(found.x)
     unit = np.where(problem.logarithmic, np.exp(np.where(problem.logarithmic, found.x, 0.0)), 1.0)
     covariance = covariance * np.outer(unit, unit)
@@ -155,6 +155,8 @@ class _Problem:
         self.start = self._to_vector([f.start for f in free.values()])
         self.mean = self._to_vector([f.prior[0] if f.prior else f.start for f in free.values()])
         self.weight = np.array([1.0 / f.prior[1] if f.prior else 0.0 for f in free.values()])
+        # Derivatives are asked for where residuals were asked for last, and the covariance where derivatives were.
+        self.residuals, self.derivatives = lru_cache(1)(self.residuals), lru_cache(1)(self.derivatives)
 
     def _to_vector(self, values):
         values = np.array(values, float)
@@ -171,17 +173,16 @@ class _Problem:
         return dict(zip(self.keys, values.tolist(), strict=True))
 
     def residuals(self, x):
+        """By block; ``x`` is the searched vector as a tuple, here and in `derivatives`."""
         values = self.values(x)
         return list(self.map(lambda block: block.residual(values), self.blocks))
 
     def derivatives(self, x):
         """Residuals and their derivatives by the searched vector, for each block."""
-        return list(self.map(partial(self._derivative, x), range(len(self.blocks))))
+        return list(self.map(partial(self._derivative, np.array(x)), self.blocks, self.columns, self.residuals(x)))
 
-    def _derivative(self, x, number):
-        block, columns = self.blocks[number], self.columns[number]
+    def _derivative(self, x, block, columns, residual):
         values = self.values(x)
-        residual = block.residual(values)
         if block.derivative:
             slopes = np.where(self.logarithmic[columns], [values[key] for key in block.keys], 1.0)
             return residual, block.derivative(values) * slopes
@@ -194,7 +195,7 @@ class _Problem:
         return residual, derivative
 
     def reduced(self, x):
-        cost = sum(float(residual @ residual) for residual in self.residuals(x))
+        cost = sum(float(residual @ residual) for residual in self.residuals(tuple(x)))
         vector = np.zeros(len(x) + 1)
         vector[0] = np.sqrt(cost + np.sum((self.weight * (x - self.mean)) ** 2))
         return vector
@@ -203,7 +204,7 @@ class _Problem:
         """Jacobian of `reduced`: that of all residuals, turned so that they point along the first row."""
         count = len(x)
         parts = [np.column_stack([np.diag(self.weight), self.weight * (x - self.mean)])]
-        for columns, (residual, derivative) in zip(self.columns, self.derivatives(x), strict=True):
+        for columns, (residual, derivative) in zip(self.columns, self.derivatives(tuple(x)), strict=True):
             triangle = _triangle(np.column_stack([derivative, residual]))
             part = np.zeros((len(triangle), count + 1))
             part[:, columns], part[:, -1] = triangle[:, :-1], triangle[:, -1]
@@ -220,7 +221,7 @@ class _Problem:
         count = len(x)
         prior = np.diag(self.weight**2)
         normals, scores = [], []
-        for block, columns, (residual, derivative) in zip(self.blocks, self.columns, self.derivatives(x), strict=True):
+        for block, columns, (residual, derivative) in zip(self.blocks, self.columns, self.derivatives(tuple(x)), strict=True):
             starts = np.flatnonzero(np.diff(block.episode, prepend=block.episode[:1] - 1))
             for rows in map(slice, starts, [*starts[1:], len(residual)]):
                 normal, score = np.zeros((count, count)), np.zeros(count)

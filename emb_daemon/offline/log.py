@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.estimator.records import PARAMETERS, SAMPLE
 from emb_daemon.logs.columns import Decoder, References, crc_is_right
 from emb_daemon.logs.read import ids_in, read_frames
 from emb_daemon.pipeline import Pipeline
@@ -94,11 +94,12 @@ def samples_in(frames: np.ndarray, corners: tuple[str, ...]) -> tuple[np.ndarray
 
 def collect(frames: np.ndarray, pipeline: Pipeline) -> np.ndarray:
     """All samples that a pipeline finds in frames, going on from where it was."""
-    parts, start = [], 0
+    found, start = bytearray(), 0
     while start < len(frames):
         start, count = pipeline.collect(frames, start, predictions=False)
-        parts.append(pipeline.samples[:count].copy())
-    return np.concatenate(parts)
+        # By their bytes: numpy copies records field by field, which takes ten times as long.
+        found += pipeline.samples[:count].tobytes()
+    return np.frombuffer(found, SAMPLE)
 
 
 def make_log(samples: np.ndarray, frames: np.ndarray, corner: str, path: Path) -> Log:
