@@ -7,7 +7,7 @@ import pytest
 from emb_daemon.estimator.contact import place_contact
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.straying import attribute_straying
-from emb_daemon.models.fusion import CONTACT
+from emb_daemon.models.fusion import CONTACT, COULOMB, OFFSET
 from emb_daemon.models.wander import WANDER, leave_stretch, watch_wander
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
@@ -162,6 +162,22 @@ def test_an_angle_that_creeps_in_a_hold_does_not_slide_the_gear(p, seed):
     held = slice(-5000, None)
     missed = np.abs(estimates["torque_force"] - force)[held] / estimates["torque_sigma"][held]
     assert np.nanmedian(missed) < 1.3
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("rad_per_s", [-0.05, 0.05])
+def test_an_angle_that_begins_to_creep_while_the_motor_stands_is_no_other_gear(p, rad_per_s, seed):
+    """Before the drift can be known at all: the gear would slide by it in half a second, against a current that says nothing
+    of that, and friction and current offset would have jumped. A motor that turns back does not stand."""
+    angle = np.concatenate((brake.stops(p, 3, seed), np.zeros(1000), brake.stops(p, 2, seed)))
+    begin = 3 * len(brake.stops(p, 1, seed)) + 100
+    rows, _ = brake.samples(p, angle)
+    rows = brake.noisy(rows, p, seed)
+    rows["angle"] += rad_per_s * _DT * np.clip(np.arange(len(rows)) - begin, 0, 850)
+    state = new_state()
+    estimate(rows[: begin + 850], p, state)
+    learned = state["error"][0, [COULOMB, OFFSET]] / p["offset_friction"]
+    assert np.all(np.abs(learned) < 0.25), learned
 
 
 @pytest.mark.parametrize("placed", [False, True])

@@ -46,11 +46,12 @@ def follow_straying(s: Record, travel: float, speed: float, dt: float) -> None:
     # The share is the same all the time, so that its error adds up.
     a.walked = (max(2.0 * _variance(a) * a.strayed * strays, 0.0) + w.unseen * w.unseen) * sq(s.gear_slope)
     w.unseen = 0.0
-    a.speed += (1.0 - exp(-dt / _SMOOTHED_S)) * (speed - a.speed)
-    noise = s.speed_sigma * sqrt(0.5 * dt / _SMOOTHED_S)
+    # What is certainly motion counts as just that: a fast stroke would otherwise be remembered for a second.
+    most, noise = OFFSET_RAD_PER_S + _NOISE * s.speed_sigma, s.speed_sigma * sqrt(0.5 * dt / _SMOOTHED_S)
+    a.speed += (1.0 - exp(-dt / _SMOOTHED_S)) * (min(max(speed, -most), most) - a.speed)
     # An angle that moves while the speed, now and of late, shows nothing may stray: it does not slide the gear, and what
     # friction carries at rest stays unknown.
-    a.creeps = max(abs(a.speed) - _NOISE * noise, abs(speed) - _NOISE * s.speed_sigma) < OFFSET_RAD_PER_S
+    a.creeps = abs(speed) < most and abs(a.speed) < OFFSET_RAD_PER_S + _NOISE * noise
 
 
 @njit
