@@ -16,6 +16,7 @@ from emb_daemon.calibration.curves import Curve, curve_at, rising_force
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, TORQUE_CONSTANT, moved, value_of
 from emb_daemon.calibration.terms import Term
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.diagnosis import EPISODES
 from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet
@@ -36,10 +37,11 @@ from emb_daemon.identify.dynamics import (
     starting_point,
 )
 from emb_daemon.identify.steps import attribution, contact, noise, stiffness, torque
+from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
 from emb_daemon.offline import log_of
-from emb_daemon.offline.run import run_step
+from emb_daemon.offline.run import held, run_step
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
@@ -404,6 +406,23 @@ def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current(monke
     monkeypatch.setattr(torque, "run_step", lost)
     assert rmse(unexplained_current(log, found, known, hot=True).current_A) == pytest.approx(hot, rel=0.1)
     assert np.isfinite(unexplained_current(log, found, known, hot=True).current_A).all()
+
+
+def test_what_a_term_over_temperature_does_to_cold_pads_is_no_error_of_a_fold():
+    """Of 27 % it was, where the term and the curve beside it were found together: a brake that knew its force to 30 N stated
+    a tenth of it."""
+    term = Term(
+        name="term:stiffness:surface_temperature", port="stiffness", signal="surface_temperature", shape="decay",
+        coefficient=-0.2, scale=600.0, low=20.0, high=300.0,
+    )  # fmt: skip
+    known = replace(load_calibration(resource("config/calibration.yaml")), terms=(term,))
+    log = log_of(simulate_log(plant_from_calibration(known, seed=3), rest(1.0) + rig_stop(15e3, 1.0), seed=3)[0])
+    force = run_step(log.samples, held(to_parameters(known)))["force"]
+    log = dataclasses.replace(log, force_N=force)
+    found = TorqueFit({key: value_of(known, key) for key in KEYS}, np.eye(len(KEYS)), {})
+    fold = Fold(pads=Pads(known.pad_thickness_mm, (log,)), held_out=(log,), torque=found, errors=[], unexplained=[])
+    [(error, _)] = fold.under(known).errors
+    assert rmse(force) > 3000.0 and rmse(error) < 1.0
 
 
 def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
