@@ -66,7 +66,7 @@ def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selecti
         progress("making a term for the heat balance")
         selection = _with_heat_terms(selection)
     for channel in (channel for channel in selection.model.bench.channels if channel in LASTING):
-        if channel != CHANNEL_OF_HEAT and _wanted(selection, channel):
+        if channel != CHANNEL_OF_HEAT and selection.model.own(channel) and _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             selection = _without_shadows(_with_terms(selection, channel), selection, channel)
             selection = _with_orders_again(_called_by_name(selection, channel), channel)
