@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from browserkit import assert_is_drawn
-from diagnosekit import drive, drives, with_late_angle
+from diagnosekit import drive, drives, with_late
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import moved
@@ -194,7 +194,7 @@ def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monke
 @pytest.mark.trial
 @pytest.mark.parametrize(("samples", "seed"), [(3, 57), (8, 57), (12, 57), (12, 61)])
 def test_an_angle_that_is_many_samples_old_is_no_relaxation(calibration, samples, seed):
-    fit_log, val_log = (with_late_angle(log_of(frames), samples) for frames in drives(calibration, seed, {}))
+    fit_log, val_log = (with_late(log_of(frames), samples, "angle") for frames in drives(calibration, seed, {}))
     result = diagnose([fit_log], calibration, [val_log])
     found = {finding.effect.name: finding for finding in result.accepted}
     before, after = result.before.rmse("fused"), result.after.rmse("fused")
@@ -207,6 +207,28 @@ def test_an_angle_that_is_many_samples_old_is_no_relaxation(calibration, samples
     assert before > 100.0 and after < 60.0
     assert result.unexplained is None
     assert len(found) == 1
+
+
+@pytest.mark.trial
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (("current_q",), "The current comes {} ms after the motion that it causes: nothing is looked for on the torque path"),
+        (
+            ("angle", "speed"),
+            "Angle and speed come {} ms after the current that moves them: nothing is looked for on either path",
+        ),
+    ],
+)
+@pytest.mark.parametrize("samples", [2, 12])
+def test_current_and_motion_of_two_times_are_said_and_make_no_effect(calibration, names, told, samples):
+    """Inertia torques at the wrong time made a viscous friction, also one that drives, and terms over the motor's speed."""
+    fit_log, val_log = (with_late(log_of(frames), samples, *names) for frames in drives(calibration, 57, {}))
+    result = diagnose([fit_log], calibration, [val_log])
+    assert not result.accepted and told.format(4 * samples) in verdict(result)
+    found = report(result)
+    assert found["unexplained"]["present"]
+    assert found["current_late_s"] == pytest.approx((0.004 if names == ("current_q",) else -0.004) * samples, abs=1e-3)
 
 
 @pytest.mark.trial

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from diagnosekit import drives, with_late_angle
+from diagnosekit import drives, with_late
 
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.terms import Term
@@ -183,7 +183,7 @@ def test_noise_of_the_current_counts_alike_where_its_constant_follows_it(calibra
 
 def test_a_search_begins_with_what_signals_alone_tell_and_only_far_from_the_calibration(calibration):
     log, key = log_of(next(drives(calibration, 61, {}, stops=1))), "effects.signal_delay.delay_s"
-    late = with_late_angle(log, 5)
+    late = with_late(log, 5, "angle")
     bench = Bench([late], calibration)
     [(coordinate, age)] = search._told(Model.of(bench)).items()
     assert (coordinate.name, bench.told) == (key, {key: age}) and age == pytest.approx(0.02, abs=3e-4)
@@ -241,3 +241,30 @@ def test_with_heat_held_the_paths_are_those_of_the_step(calibration, moved_rad):
         )
     )
     assert rmse(change - expected) < 0.03 * rmse(expected)
+
+
+@pytest.mark.parametrize(
+    ("late", "names", "found_s", "asked"),
+    [
+        (0, (), 0.0, {"stiffness", "torque"}),
+        (12, ("angle",), 0.0, {"stiffness", "torque"}),
+        (1, ("current_q",), 0.0, {"stiffness", "torque"}),
+        (2, ("current_q",), 0.008, {"stiffness"}),
+        (12, ("current_q",), 0.048, {"stiffness"}),
+        (2, ("angle", "speed"), -0.008, set()),
+        (12, ("angle", "speed"), -0.048, set()),
+    ],
+)
+def test_paths_of_two_times_are_judged_and_not_searched(calibration, brake_log, late, names, found_s, asked):
+    """The current changes when the motor accelerates, whatever the calibration says of either; a late angle alone is another
+    matter."""
+    bench = Bench([with_late(brake_log, late, *names)], calibration)
+    assert bench.current_late_s == pytest.approx(found_s, abs=1e-3)
+    assert {"stiffness", "torque"} <= {*bench.channels}
+    assert {channel for channel in ("stiffness", "torque") if bench.channel_of(channel)} == asked
+    assert {c.channel for c in Model.of(bench).values} & {"stiffness", "torque"} == asked
+
+
+@pytest.fixture(scope="module")
+def brake_log(calibration):
+    return log_of(next(drives(calibration, 57, {}, stops=1)))

@@ -239,8 +239,8 @@ class Bench:
         self.clamps: bool = calibration.contact.is_in_reach
         self.has_current: bool = any(trial.log.samples["has_current"].any() for trial in self.trials)
         late = [_current_late_s(trial) for trial in self.trials] if self.clamps and self.has_reference else [0.0]
-        #: Time by which the current comes after the motion that it causes, s, negative if before: then nothing that is looked
-        #: for explains the torque path, and whatever is found there would be a shadow of that.
+        #: Time by which the current comes after the motion that it causes, s; negative if the motion comes after it, and after
+        #: the force. Nothing that is looked for explains a path of two times: what is found there is a shadow of that.
         self.current_late_s: float = max(late, key=abs)
         self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
@@ -326,8 +326,8 @@ class Bench:
         """Channel in which a change shows that shows in ``channel`` where all is measured; None where these logs have none."""
         if channel in ("stiffness", "torque") and not self.has_reference:
             channel = "innovation"
-        of_one_time = self.current_late_s == 0.0 or channel != "torque"
-        return channel if channel in self.channels and of_one_time else None
+        late = {"torque": self.current_late_s != 0.0, "stiffness": self.current_late_s < 0.0}
+        return channel if channel in self.channels and not late.get(channel, False) else None
 
     def disturbed(self, disturb: Callable, random: np.random.Generator) -> "Bench":
         """The same logs with samples disturbed: (SAMPLE rows, episode of each, generator) → rows."""

@@ -107,15 +107,14 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
 
 
 def _apart(diagnosis: Diagnosis) -> list[str]:
-    """Current and motion of two times, of which nobody can tell the late one by these signals alone."""
+    """Current and motion of two times: no cause comes after what it does."""
     late_ms = 1e3 * diagnosis.bench.current_late_s
     if not late_ms:
         return []
-    way = "after" if late_ms > 0.0 else "before"
-    return [
-        f"The current comes {abs(late_ms):.0f} ms {way} the motion that it causes: one of the two is late, and nothing is "
-        "looked for on the torque path until they are of one time."
-    ]
+    what, on = f"The current comes {late_ms:.0f} ms after the motion that it causes", "the torque path"
+    if late_ms < 0.0:
+        what, on = f"Angle and speed come {-late_ms:.0f} ms after the current that moves them", "either path"
+    return [f"{what}: nothing is looked for on {on} until they are of one time."]
 
 
 def _outside(diagnosis: Diagnosis) -> list[str]:
