@@ -248,18 +248,17 @@ def test_with_heat_held_the_paths_are_those_of_the_step(calibration, moved_rad):
     [
         (0, (), 0.0, {"stiffness", "torque"}),
         (12, ("angle",), 0.0, {"stiffness", "torque"}),
-        (1, ("current_q",), 0.0, {"stiffness", "torque"}),
-        (2, ("current_q",), 0.008, {"stiffness"}),
+        (1, ("current_q",), 0.004, {"stiffness"}),
         (12, ("current_q",), 0.048, {"stiffness"}),
-        (2, ("angle", "speed"), -0.008, set()),
+        (1, ("angle", "speed"), -0.004, {"stiffness"}),
         (12, ("angle", "speed"), -0.048, set()),
     ],
 )
 def test_paths_of_two_times_are_judged_and_not_searched(calibration, brake_log, late, names, found_s, asked):
-    """The current changes when the motor accelerates, whatever the calibration says of either; a late angle alone is another
-    matter."""
+    """The current changes when the motor accelerates, whatever the calibration says of either. A late angle alone is another
+    matter, and a motion that is a sample late can be told by the catalogue's own test."""
     bench = Bench([with_late(brake_log, late, *names)], calibration)
-    assert bench.current_late_s == pytest.approx(found_s, abs=1e-3)
+    assert bench.current_late_s == pytest.approx(found_s, abs=1.5e-3)
     assert {"stiffness", "torque"} <= {*bench.channels}
     assert {channel for channel in ("stiffness", "torque") if bench.channel_of(channel)} == asked
     assert {c.channel for c in Model.of(bench).values} & {"stiffness", "torque"} == asked

@@ -60,8 +60,10 @@ _MORE_A = 0.1
 #: Samples from which a search begins where signals alone say: a speed that is the mean of its cycle, or a frame that waits for
 #: the next, is off by up to one, and so near the catalogue's own test leads there. Standard deviations that are certain.
 _FAR, _SURELY = 2.0, 5.0
-#: Current and motion are compared over so many ms, more than the longest age that a calibration may state.
-_LONGEST_MS = 60
+#: Current and motion are compared over so many ms, more than the longest age that a calibration may state. Share of a cycle
+#: by which they may be apart, as the estimate allows for (`models.alignment`): a whole one made 550 N of viscous friction
+#: that is not there. Share of a large acceleration from which the motor accelerates; holds tell nothing of the time.
+_LONGEST_MS, _WITHIN, _ACCELERATES = 60, 0.6, 0.1
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -171,8 +173,9 @@ def _current_late_s(trial: Trial) -> float:
         return 0.0
     gained = np.diff(speed, prepend=speed[:1]) / np.maximum(samples["dt"][rows], CYCLE_S)
     columns = np.column_stack([np.ones(len(rows)), np.sign(speed), speed, gained, force, force * np.sign(speed)])
-    late_s = 1e-3 * current_late_ms(Series(time, samples["current_q"][rows]), time, columns, _LONGEST_MS)
-    return late_s if abs(late_s) > max(ONE_CYCLE_S, 1.5 * float(np.median(samples["dt"]))) else 0.0
+    current, told = Series(time, samples["current_q"][rows]), np.abs(gained) > _ACCELERATES * np.quantile(np.abs(gained), 0.99)
+    late_s = 1e-3 * current_late_ms(current, time[told], columns[told], _LONGEST_MS)
+    return late_s if abs(late_s) > _WITHIN * max(CYCLE_S, float(np.median(samples["dt"]))) else 0.0
 
 
 def _told_by_signals(logs: Sequence[Log], calibration: Calibration) -> dict[str, float]:
@@ -326,7 +329,8 @@ class Bench:
         """Channel in which a change shows that shows in ``channel`` where all is measured; None where these logs have none."""
         if channel in ("stiffness", "torque") and not self.has_reference:
             channel = "innovation"
-        late = {"torque": self.current_late_s != 0.0, "stiffness": self.current_late_s < 0.0}
+        sample_s = max(float(np.median(trial.log.samples["dt"])) for trial in self.trials)
+        late = {"torque": self.current_late_s != 0.0, "stiffness": self.current_late_s < -_FAR * sample_s}
         return channel if channel in self.channels and not late.get(channel, False) else None
 
     def disturbed(self, disturb: Callable, random: np.random.Generator) -> "Bench":

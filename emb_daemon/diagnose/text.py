@@ -113,7 +113,8 @@ def _apart(diagnosis: Diagnosis) -> list[str]:
         return []
     what, on = f"The current comes {late_ms:.0f} ms after the motion that it causes", "the torque path"
     if late_ms < 0.0:
-        what, on = f"Angle and speed come {-late_ms:.0f} ms after the current that moves them", "either path"
+        what = f"Angle and speed come {-late_ms:.0f} ms after the current that moves them"
+        on = on if diagnosis.bench.channel_of("stiffness") else "either path"
     return [f"{what}: nothing is looked for on {on} until they are of one time."]
 
 
