@@ -26,8 +26,9 @@ def drives(calibration, seed, effects, reference=True, stops=5, drive=drive):
         yield simulate_log(plant, schedule, seed=seed + k, reference=reference)[0]
 
 
-def with_late_angle(log, samples):
-    """The log with motor angles that are so many ``samples`` old, beside speeds that are not."""
+def with_late(log, samples, *names):
+    """The log with ``names`` of its signals so many ``samples`` old, beside others that are not."""
     rows = log.samples.copy()
-    rows["angle"] = np.concatenate([np.full(samples, rows["angle"][0]), rows["angle"][:-samples]])
+    for name in names:
+        rows[name] = np.concatenate([np.full(samples, rows[name][0]), rows[name][:-samples]])
     return dataclasses.replace(log, samples=rows)

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from browserkit import assert_is_drawn
-from diagnosekit import drive, drives, with_late_angle
+from diagnosekit import drive, drives, with_late
 
 from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.parameters import moved
@@ -192,9 +192,9 @@ def test_an_uneven_disc_is_never_found_under_a_standing_wheel(calibration, monke
 
 
 @pytest.mark.trial
-@pytest.mark.parametrize("samples", [3, 8, 12])
-def test_an_angle_that_is_many_samples_old_is_no_relaxation(calibration, samples):
-    fit_log, val_log = (with_late_angle(log_of(frames), samples) for frames in drives(calibration, 57, {}))
+@pytest.mark.parametrize(("samples", "seed"), [(3, 57), (8, 57), (12, 57), (12, 61)])
+def test_an_angle_that_is_many_samples_old_is_no_relaxation(calibration, samples, seed):
+    fit_log, val_log = (with_late(log_of(frames), samples, "angle") for frames in drives(calibration, seed, {}))
     result = diagnose([fit_log], calibration, [val_log])
     found = {finding.effect.name: finding for finding in result.accepted}
     before, after = result.before.rmse("fused"), result.after.rmse("fused")
@@ -206,9 +206,30 @@ def test_an_angle_that_is_many_samples_old_is_no_relaxation(calibration, samples
     )
     assert before > 100.0 and after < 60.0
     assert result.unexplained is None
-    if samples == 12 and len(found) > 1:
-        pytest.xfail(f"beside 48 ms of delay {', '.join(found)}: a term that is not there")
     assert len(found) == 1
+
+
+@pytest.mark.trial
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (("current_q",), "The current comes {} ms after the motion that it causes: nothing is looked for on the torque path"),
+        (
+            ("angle", "speed"),
+            "Angle and speed come {} ms after the current that moves them: nothing is looked for on ",
+        ),
+    ],
+)
+@pytest.mark.parametrize("samples", [1, 12])
+def test_current_and_motion_of_two_times_are_said_and_make_no_effect(calibration, names, told, samples):
+    """Inertia torques at the wrong time made a viscous friction, also one that drives, and terms over the motor's speed."""
+    fit_log, val_log = (with_late(log_of(frames), samples, *names) for frames in drives(calibration, 57, {}))
+    result = diagnose([fit_log], calibration, [val_log])
+    assert {f.effect.name for f in result.accepted} == ({"signal_delay"} if "angle" in names and samples == 1 else set())
+    found = report(result)
+    assert told.format(round(1e3 * abs(found["current_late_s"]))) in verdict(result)
+    assert found["unexplained"]["present"]
+    assert found["current_late_s"] == pytest.approx((0.004 if names == ("current_q",) else -0.004) * samples, abs=2e-3)
 
 
 @pytest.mark.trial

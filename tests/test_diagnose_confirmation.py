@@ -9,7 +9,7 @@ import pytest
 from diagnosekit import drives
 
 from emb_daemon.calibration.parameters import moved
-from emb_daemon.diagnose import confirmation, diagnosis, grammar
+from emb_daemon.diagnose import confirmation, diagnosis, grammar, search
 from emb_daemon.diagnose.comparison import episodes_by_log
 from emb_daemon.diagnose.coordinates import TOLERATED
 from emb_daemon.diagnose.diagnosis import Recalibrated, diagnose
@@ -17,7 +17,7 @@ from emb_daemon.diagnose.model import LASTING, rms_known
 from emb_daemon.diagnose.page import page
 from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
-from emb_daemon.diagnose.screening import Screening
+from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import revise
 from emb_daemon.diagnose.text import verdict
@@ -340,6 +340,7 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
         reasons: dict[str, str]
         model = SimpleNamespace(bench=bench)
         recalibrated = ()
+        instead = None
 
         def without(self, suspect, reason):
             return Chosen([name for name in self.suspects if name != suspect], self.reasons | {suspect: reason})
@@ -382,6 +383,7 @@ def test_a_recalibration_that_went_for_what_an_effect_did_comes_back(monkeypatch
             bench=SimpleNamespace(calibration=None, residuals=lambda _: {}), refined=lambda _: Chosen.model
         )
         touched = property(lambda self: {*self.recalibrated})
+        instead = None
 
         def without(self, suspect, _):
             left = {c: gain for c, gain in self.recalibrated.items() if c != suspect}
@@ -404,3 +406,33 @@ def test_a_recalibration_that_went_for_what_an_effect_did_comes_back(monkeypatch
     monkeypatch.setattr(confirmation, "replace", replaced)
     found, _ = confirmation.confirm(Chosen({"torque": 50.0, "stiffness": 20.0}), None)
     assert found.accepted == () and found.recalibrated == {"torque": 50.0}
+
+
+@pytest.mark.parametrize(("made_N2", "name"), [(90.0, "term:torque:motor_speed"), (110.0, "current_offset")])
+def test_an_effect_that_gave_way_to_a_term_is_asked_again_where_nothing_was_fitted(monkeypatch, viscous, made_N2, name):
+    """In one log a term may describe shortly what is another cause: a shorter one, of what others leave, is believed."""
+    base = dataclasses.replace(viscous[0], candidates={})
+    offset = next(effect for effect in REGISTRY if effect.name == "current_offset")
+    term = dataclasses.replace(offset, name="term:torque:motor_speed")
+    named, made = (base.noted([Candidate(effect, "torque", accepted=True)]) for effect in (offset, term))
+    monkeypatch.setattr(confirmation, "_confirmed", lambda selection, judges: (selection, selection))
+    monkeypatch.setattr(confirmation, "_left", lambda s, _: {"torque": 100.0 if s is named else made_N2})
+    found, of = confirmation.confirm(dataclasses.replace(made, instead=named), None)
+    assert found.accepted == of.accepted == [name]
+    assert name == term.name or "leave less" in found.candidates[term.name].reason
+
+
+@pytest.mark.parametrize("gave_way", [True, False])
+def test_what_gave_way_to_a_term_is_kept_beside_it(monkeypatch, viscous, gave_way):
+    bench = viscous[0].model.bench
+    term = dataclasses.replace(REGISTRY[0], name="term:torque:motor_speed")
+
+    def make(selection, progress):
+        left = selection.without("viscous_friction", "a term does as much") if gave_way else selection
+        return left.noted([Candidate(term, "torque", accepted=True)])
+
+    monkeypatch.setattr(search, "make_terms", make)
+    monkeypatch.setattr(search, "_finished", lambda selection: selection)
+    found = select(bench, lambda text, share: None)
+    assert term.name in found.accepted and ("viscous_friction" in found.accepted) != gave_way
+    assert (found.instead.accepted if gave_way else found.instead) == (["viscous_friction"] if gave_way else None)

@@ -11,7 +11,7 @@ from scipy.stats import f as f_distribution
 
 from emb_daemon.diagnose.confirmation import _fits_without
 from emb_daemon.diagnose.episodes import episodes
-from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out, solve_within
+from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out, leave_out_within, solve_within
 
 
 def _autocorrelated(rng, episodes_, samples):
@@ -286,6 +286,21 @@ def test_what_a_bound_holds_the_others_do_otherwise():
     assert free == pytest.approx(np.linalg.lstsq(table, target)[0], rel=1e-4) and free[0] < 0.0
     held = solve_within(moments, np.zeros(2), np.array([0.0, -np.inf]), np.full(2, np.inf))
     assert held[0] == 0.0 and held[1] == pytest.approx(table[:, 1] @ target / (table[:, 1] @ table[:, 1]), rel=1e-6)
+
+
+def test_what_would_have_to_pass_a_bound_without_a_candidate_is_no_reason_against_it():
+    """A drag over the square of a speed is nearly a steeper one in proportion less a friction, which may not be negative."""
+    random = np.random.default_rng(2)
+    speed = np.repeat(random.uniform(0.5, 1.0, 60), 20)
+    table = np.column_stack([np.ones(1200), speed, speed**2])
+    moments = Moments.of(table, 1.0 * speed**2 + 0.01 * random.normal(size=1200), np.arange(1200) // 100, 12)
+    plain, penalty = moments.select([0, 1]), np.zeros(3)
+    low, high = np.array([0.0, -np.inf]), np.full(2, np.inf)
+    within = leave_out_within(plain, penalty[:2], low, high)
+    assert within.sum() == pytest.approx(leave_out(plain.select([1]), penalty[:1]).left_out.sum(), rel=1e-6)
+    assert judge(moments, [0, 1], [2], penalty, within).gain > 5.0 * judge(moments, [0, 1], [2], penalty).gain > 0.0
+    far = leave_out_within(plain, penalty[:2], np.array([-5.0, -np.inf]), high)
+    np.testing.assert_allclose(far, leave_out(plain, penalty[:2]).left_out, rtol=1e-9)
 
 
 @pytest.mark.parametrize("phases", [2, 3, 4, 5, 8])

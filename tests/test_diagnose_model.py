@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from diagnosekit import drives, with_late_angle
+from diagnosekit import drives, with_late
 
 from emb_daemon.calibration.parameters import moved, value_of
 from emb_daemon.calibration.terms import Term
@@ -183,7 +183,7 @@ def test_noise_of_the_current_counts_alike_where_its_constant_follows_it(calibra
 
 def test_a_search_begins_with_what_signals_alone_tell_and_only_far_from_the_calibration(calibration):
     log, key = log_of(next(drives(calibration, 61, {}, stops=1))), "effects.signal_delay.delay_s"
-    late = with_late_angle(log, 5)
+    late = with_late(log, 5, "angle")
     bench = Bench([late], calibration)
     [(coordinate, age)] = search._told(Model.of(bench)).items()
     assert (coordinate.name, bench.told) == (key, {key: age}) and age == pytest.approx(0.02, abs=3e-4)
@@ -219,16 +219,20 @@ def test_bench_runs_the_production_estimator(calibration):
     np.testing.assert_array_equal(bench.residuals({})["stiffness"], np.nan_to_num(expected))
 
 
-def test_with_heat_held_the_paths_are_those_of_the_step(calibration):
-    """What a fit's derivatives run is the estimator to the last bit, and moves with a parameter as the whole step does."""
+@pytest.mark.parametrize("moved_rad", [0.0, -64.0])
+def test_with_heat_held_the_paths_are_those_of_the_step(calibration, moved_rad):
+    """What a fit's derivatives run is the estimator to the last bit, and moves with a parameter as the whole step does. Where
+    the resolver loses its zero the contact is learned anew with a slope that is a mean, by some hundredths of a newton."""
     samples = log_of(next(drives(calibration, 61, {}, stops=2))).samples
+    samples["angle"][len(samples) // 2 :] += moved_rad
     p = held(to_parameters(calibration))[0]
     stiffer = p.copy()
     stiffer["curve"] *= 1.01
     whole, heat = run_with_heat(samples, p)
+    assert np.count_nonzero(heat["zero_moved"]) == (moved_rad != 0.0)
     fast = run_held(samples, p, heat)
     for name in ("force", "torque", "leverage", "torque_constant"):
-        np.testing.assert_array_equal(fast[name], whole[name])
+        np.testing.assert_allclose(fast[name], whole[name], rtol=1e-5 if moved_rad else 0.0)
     change, expected = (
         run(stiffer) - base["force"]
         for run, base in (
@@ -237,3 +241,29 @@ def test_with_heat_held_the_paths_are_those_of_the_step(calibration):
         )
     )
     assert rmse(change - expected) < 0.03 * rmse(expected)
+
+
+@pytest.mark.parametrize(
+    ("late", "names", "found_s", "asked"),
+    [
+        (0, (), 0.0, {"stiffness", "torque"}),
+        (12, ("angle",), 0.0, {"stiffness", "torque"}),
+        (1, ("current_q",), 0.004, {"stiffness"}),
+        (12, ("current_q",), 0.048, {"stiffness"}),
+        (1, ("angle", "speed"), -0.004, {"stiffness"}),
+        (12, ("angle", "speed"), -0.048, set()),
+    ],
+)
+def test_paths_of_two_times_are_judged_and_not_searched(calibration, brake_log, late, names, found_s, asked):
+    """The current changes when the motor accelerates, whatever the calibration says of either. A late angle alone is another
+    matter, and a motion that is a sample late can be told by the catalogue's own test."""
+    bench = Bench([with_late(brake_log, late, *names)], calibration)
+    assert bench.current_late_s == pytest.approx(found_s, abs=1.5e-3)
+    assert {"stiffness", "torque"} <= {*bench.channels}
+    assert {channel for channel in ("stiffness", "torque") if bench.channel_of(channel)} == asked
+    assert {c.channel for c in Model.of(bench).values} & {"stiffness", "torque"} == asked
+
+
+@pytest.fixture(scope="module")
+def brake_log(calibration):
+    return log_of(next(drives(calibration, 57, {}, stops=1)))

@@ -503,6 +503,19 @@ def test_an_offset_that_begins_in_a_brake_that_clamps_is_taken_off_once_it_is_re
     assert np.mean(np.abs(estimates["force"] - force)[second] > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01
 
 
+def test_a_motor_that_starts_before_an_old_angle_shows_it_has_neither_a_noisy_speed_nor_one_with_an_offset(parameters):
+    """For 48 ms the angle still stands; tens of rad/s of noise, or a hundredth as an offset, move the zero by radians."""
+    p, state, worst, offset = parameters.copy(), new_state(), 0.0, 0.0
+    rows = city.drive(0, 40.0)[0].copy()
+    rows["angle"] = np.concatenate([np.full(12, rows["angle"][0]), rows["angle"][:-12]])
+    p["effects"]["signal_delay"]["delay_s"] = 12 * _DT
+    for row in range(0, len(rows), 5):
+        estimate(rows[row : row + 5], p, state)
+        worst = max(worst, state["speed_sigma"][0])
+        offset = max(offset, abs(state["lateness"]["offset"][0]))
+    assert worst < 2.0 * p["speed_sigma"][0] and offset < 0.2
+
+
 @pytest.mark.parametrize("speed", [0.3, 1.0, 2.0])
 def test_an_angle_that_is_frozen_while_the_motor_closes_slowly_is_no_offset_of_the_speed(parameters, speed):
     """Else kilonewtons would come of which nothing is said."""

@@ -34,9 +34,37 @@ _KEPT = 0.99
 
 
 def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
+    """The selection without everything that makes the running estimator worse; what effects of the catalogue alone make of it
+    if they leave less of a path than terms for which some of them went.
+
+    Returns it with the errors on left-out episodes. ``judges``: the validation logs."""
+    confirmed = _confirmed(selection, judges)
+    if selection.instead is None:
+        return confirmed
+    alone = _confirmed(selection.instead, judges)
+    (made, named), terms = (
+        (_left(s, judges) for s, _ in (confirmed, alone)),
+        [c for c in selection.candidates.values() if c.made],
+    )
+    if all(made[c.channel] < named[c.channel] for c in terms if c.accepted and c.channel in made):
+        return confirmed
+    worse = "effects of the catalogue alone leave less of left-out episodes and validation logs"
+    return alone[0].noted(replace(c, accepted=False, reason=worse if c.accepted else c.reason) for c in terms), alone[1]
+
+
+def _left(selection: Selection, judges: Bench | None) -> dict[str, float]:
+    """Mean square by force path, N², of what is left of left-out episodes and validation logs."""
+    parts = [_left_out_residuals(selection)]
+    if judges:
+        parts.append(judges.under(selection.model.bench.calibrated(selection.applied())).residuals({}))
+    there = [c for c in FORCE_CHANNELS if all(c in part for part in parts)]
+    return {c: float(np.mean(np.concatenate([part[c] for part in parts]) ** 2)) for c in there}
+
+
+def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
     """The selection without everything that makes the running estimator worse.
 
-    Returns it with the errors on left-out episodes. ``judges``: the validation logs.
+    Returns it with the errors on left-out episodes.
     """
     bench, recalibrated = selection.model.bench, selection.recalibrated
     before, main, held = errors(bench, bench.calibration), whole(bench), bench.residuals({})

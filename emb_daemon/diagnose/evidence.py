@@ -125,6 +125,16 @@ def solve_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: n
     return lsq_linear(root, np.linalg.solve(root.T, total[:-1, -1]), (low, high), "bvls").x
 
 
+def leave_out_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """`LeftOut.left_out` with what a bound holds standing there, shape (episodes,)."""
+    values = solve_within(moments, penalty, low, high)
+    free = (low < values) & (values < high)
+    turn = np.eye(len(values) + 1)
+    turn[:-1, -1] = np.where(free, 0.0, -values)
+    there = Moments(turn.T @ moments.products @ turn, moments.counts).select(np.flatnonzero(free).tolist())
+    return leave_out(there, penalty[free]).left_out
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the episodes say of a candidate.
@@ -146,8 +156,11 @@ class Evidence:
 NOT_EXCITED = Evidence(1.0, 0.0, 0.0, np.zeros(0), np.zeros(0))
 
 
-def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty: np.ndarray) -> Evidence:
-    """Test ``candidate`` columns with ``nuisances`` columns free; ``penalty`` as in `leave_out`, for all columns."""
+def judge(
+    moments: Moments, nuisances: list[int], candidate: list[int], penalty: np.ndarray, plain: np.ndarray | None = None
+) -> Evidence:
+    """Test ``candidate`` columns with ``nuisances`` columns free; ``penalty`` as in `leave_out`, for all columns. ``plain``:
+    squared error of each left-out episode without the candidate, by the nuisances alone if none is given."""
     from scipy.stats import f
 
     base = moments.select(nuisances)
@@ -158,8 +171,8 @@ def judge(moments: Moments, nuisances: list[int], candidate: list[int], penalty:
     if np.any(own <= 0.0) or not np.isfinite(total).all():
         return NOT_EXCITED
     fitted = leave_out(both, penalty[nuisances + candidate])
-    plain = leave_out(base, penalty[nuisances])
-    gain = float((plain.left_out - fitted.left_out).sum())
+    plain = leave_out(base, penalty[nuisances]).left_out if plain is None else plain
+    gain = float((plain - fitted.left_out).sum())
     # Project the nuisances out, to see how much of the candidate is its own and which episodes carry it.
     normal = total[:first, :first] + np.diag(penalty[nuisances])
     shadow = np.linalg.lstsq(normal, total[:first, first:-1], rcond=1e-12)[0] if first else np.zeros((0, count))

@@ -66,7 +66,7 @@ def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selecti
         progress("making a term for the heat balance")
         selection = _with_heat_terms(selection)
     for channel in (channel for channel in selection.model.bench.channels if channel in LASTING):
-        if channel != CHANNEL_OF_HEAT and _wanted(selection, channel):
+        if channel != CHANNEL_OF_HEAT and selection.model.own(channel) and _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
             selection = _without_shadows(_with_terms(selection, channel), selection, channel)
             selection = _with_orders_again(_called_by_name(selection, channel), channel)
@@ -115,7 +115,7 @@ def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int |
     """A selection with a term of the candidate's port and signals in each shape that holds, of at ``most`` so many that gain
     most."""
     search, result = _search(start.model, channel), []
-    prospects = search.of_means(candidate.effect.hook, candidate.signals) if search else []
+    prospects = search.of_means(candidate.effect.hook, candidate.signals)
     for prospect in sorted(prospects, key=lambda p: -p.evidence.gain)[:most]:
         effect = made_effect(prospect.form, _name(prospect.form, start))
         new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
@@ -234,8 +234,6 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     with everything else, and what then describes the rest most shortly is taken."""
     model, screening = selection.model, selection.screening
     search = _search(model, channel)
-    if search is None:
-        return selection
     floor = screening.floor(model, channel, made=True)
     prospects = search.prospects(floor)
     straight = model.bench.straight or channel != CHANNEL_OF_HEAT
@@ -366,8 +364,7 @@ def _with_orders_again(selection: Selection, channel: str) -> Selection:
         if "sine" not in [c.parameter for c in candidate.amplitudes]:
             continue
         bare = selection.without(name, "its order was chosen again")
-        signals = _signals(bare.model)
-        ripples = Search(bare.model, channel, signals).ripples() if signals else []
+        ripples = Search(bare.model, channel, _signals(bare.model)).ripples()
         lobes = [p for p in ripples if p.form.port == candidate.effect.hook and p.evidence.gain > 0.0]
         if not lobes:
             continue
@@ -383,19 +380,16 @@ def _made(selection: Selection, channel: str) -> list[str]:
     return [name for name, c in selection.candidates.items() if c.accepted and c.made and c.channel == channel]
 
 
-def _search(model: Model, channel: str) -> Search | None:
+def _search(model: Model, channel: str) -> Search:
     if channel == CHANNEL_OF_HEAT:
         return warmth.HeatSearch(model)
-    signals = _signals(model)
-    return Search(model, channel, signals) if signals else None
+    return Search(model, channel, _signals(model))
 
 
-def _signals(model: Model) -> list[np.ndarray] | None:
-    """What terms see, by log; None where an angle lost its zero."""
+def _signals(model: Model) -> list[np.ndarray]:
+    """What terms see, by log."""
     result = []
     for trial, heat in zip(model.bench.trials, model.heat, strict=True):
-        if heat is None:
-            return None
         parameters = held(to_parameters(model.bench.calibrated(model.values, trial.index)))[0]
         result.append(follow_signals(trial.log.samples, parameters, heat))
     return result
@@ -513,8 +507,7 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     if worse or evidence.gain <= 0.0 or gain < selection.screening.floor(model, channel, made=True):
         return selection.noted([replace(candidate, reason=_NOT_HELD)])
     fitted = next(term for term in bench.calibrated(model.values).terms if term.name == name)
-    search = _search(model, channel) if fitted.is_held else None
-    if not fitted.is_bounded or not (search is None or search.is_within(fitted)):
+    if not fitted.is_bounded or (fitted.is_held and not _search(model, channel).is_within(fitted)):
         return selection.noted([replace(candidate, reason=TOO_LARGE)])
     candidate = replace(candidate, amplitudes=tuple(amplitudes), evidence=evidence, gain=gain, accepted=True)
     where = " on left-out episodes" if bench.straight else ""

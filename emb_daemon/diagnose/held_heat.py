@@ -9,7 +9,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.effects.terms import SIGNALS
-from emb_daemon.estimator.paths import rest, stiffness_path, torque_path
+from emb_daemon.estimator.paths import rest, shift_zero, stiffness_path, torque_path
 from emb_daemon.estimator.records import STATE
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import stiffness_factor
@@ -31,23 +31,28 @@ def _run(samples, parameters, states, heat, out, signals):
         s.mean[0], s.mean[1] = h.mean[0], h.mean[1]
         s.pads[0, 0], s.pads[1, 0] = h.surface[0], h.surface[1]
         s.winding, s.housing = h.winding, h.housing
+        if h.zero_moved != 0.0:
+            shift_zero(s, h.zero_moved)
         rise = 0.5 * (h.mean[0] + h.mean[1]) - p.thermal.reference
         stiffness_path(s, p, m, stiffness_factor(p.thermal, rise, h.history) if h.temperature_known else 1.0)
         if len(signals) > 0:
             signals[row] = s.effects.terms.signal
+        s.contact_angle += h.contact_moved
+        s.past_contact -= h.contact_moved
+        s.force -= s.slope * h.contact_moved
         o.force = s.force
         o.torque, o.leverage, _ = torque_path(s, p, m)
+        if h.zero_moved != 0.0:
+            o.torque = np.nan
         factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
         o.torque_constant = p.torque_constant * factor
         s.angle, s.speed = m.angle, m.speed
 
 
-def run_with_heat(samples: np.ndarray, parameters: np.void) -> tuple[np.ndarray, np.ndarray | None]:
-    """TRACE rows of the whole step with `held` parameters, and its HEAT rows; None instead of them if the resolver lost its
-    zero, which a held run cannot follow."""
+def run_with_heat(samples: np.ndarray, parameters: np.void) -> tuple[np.ndarray, np.ndarray]:
+    """TRACE rows of the whole step with `held` parameters, and its HEAT rows."""
     heat = np.zeros(len(samples), HEAT)
-    trace = run_step(samples, parameters, heat)
-    return trace, heat if np.ptp(heat["contact_angle"]) == 0.0 else None
+    return run_step(samples, parameters, heat), heat
 
 
 def run_held(samples: np.ndarray, parameters: np.void, heat: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
-from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out
+from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out, leave_out_within
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
@@ -244,14 +244,21 @@ class Model:
         """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free; of means over
         ``samples``.
 
-        An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do."""
+        An effect's shape stands as fitted while its amplitudes are tested: it would explain away what they do. Where the rest
+        would have to pass a bound without them it stands there: no friction drives a motor that turns one way."""
         tested = list(values)
         channel, effects = tested[0].channel, {c.effect for c in tested if c.effect}
         rest = [c for c in self.movable(channel) if c not in values and (c.effect not in effects or not is_shape(c))]
-        restored = self.residual_at(channel, {c: self.centre.get(c, c.start) for c in rest} | dict(values))
+        start = {c: self.centre.get(c, c.start) for c in rest}
+        restored = self.residual_at(channel, start | dict(values))
         moments = self.moments(channel, [self.columns[c] for c in (*rest, *tested)], restored, samples)
         first, penalty = len(rest), self.penalty([*rest, *tested], channel)
-        return judge(moments, list(range(first)), list(range(first, len(penalty))), penalty)
+        nuisances, (low, high) = (
+            list(range(first)),
+            np.array([(c.low - start[c], c.high - start[c]) for c in rest]).reshape(-1, 2).T,
+        )
+        plain = leave_out_within(moments.select(nuisances), penalty[:first], low, high) if rest else None
+        return judge(moments, nuisances, list(range(first, len(penalty))), penalty, plain)
 
     def counted(self, channel: str) -> int:
         """Residuals of a channel that say something."""

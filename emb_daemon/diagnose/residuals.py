@@ -27,8 +27,11 @@ from emb_daemon.effects.terms import PORTS, SIGNALS
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.logs.columns import nearest
+from emb_daemon.logs.contradictions import current_late_ms
+from emb_daemon.logs.resample import Series
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.run import held, run_paths, run_step
+from emb_daemon.wire.contract import CYCLE_S
 
 #: Residuals by channel and their unit. `innovation` stands for the paths' reference where a log has none.
 UNITS = {"stiffness": "N", "torque": "N", "innovation": "N", "temperature": "K", "brake_torque": "N·m"}
@@ -57,6 +60,10 @@ _MORE_A = 0.1
 #: Samples from which a search begins where signals alone say: a speed that is the mean of its cycle, or a frame that waits for
 #: the next, is off by up to one, and so near the catalogue's own test leads there. Standard deviations that are certain.
 _FAR, _SURELY = 2.0, 5.0
+#: Current and motion are compared over so many ms, more than the longest age that a calibration may state. Share of a cycle
+#: by which they may be apart, as the estimate allows for (`models.alignment`): a whole one made 550 N of viscous friction
+#: that is not there. Share of a large acceleration from which the motor accelerates; holds tell nothing of the time.
+_LONGEST_MS, _WITHIN, _ACCELERATES = 60, 0.6, 0.1
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -162,6 +169,21 @@ def _partial_correlation(trials: Sequence[Trial]) -> float:
     return float(products[0, 1] ** 2 / size) if size > 0.0 else 0.0
 
 
+def _current_late_s(trial: Trial) -> float:
+    """Time by which the current of a brake comes after the motion and the force that it causes, s, negative if before; 0 if
+    they are of one time, as far as samples tell."""
+    samples = trial.log.samples
+    rows = np.flatnonzero(samples["has_current"])
+    speed, time, force = samples["speed"][rows], trial.log.time_ns[rows], trial.force_N[rows]
+    if len(rows) < 2:
+        return 0.0
+    gained = np.diff(speed, prepend=speed[:1]) / np.maximum(samples["dt"][rows], CYCLE_S)
+    columns = np.column_stack([np.ones(len(rows)), np.sign(speed), speed, gained, force, force * np.sign(speed)])
+    current, told = Series(time, samples["current_q"][rows]), np.abs(gained) > _ACCELERATES * np.quantile(np.abs(gained), 0.99)
+    late_s = 1e-3 * current_late_ms(current, time[told], columns[told], _LONGEST_MS)
+    return late_s if abs(late_s) > _WITHIN * max(CYCLE_S, float(np.median(samples["dt"]))) else 0.0
+
+
 def _told_by_signals(logs: Sequence[Log], calibration: Calibration) -> dict[str, float]:
     """Amplitudes that signals alone tell (`Effect.measure`) and that are surely some samples from the calibration's."""
     result = {}
@@ -221,6 +243,10 @@ class Bench:
         self.has_reference: bool = all(trial.has_force for trial in self.trials)
         self.clamps: bool = calibration.contact.is_in_reach
         self.has_current: bool = any(trial.log.samples["has_current"].any() for trial in self.trials)
+        late = [_current_late_s(trial) for trial in self.trials] if self.clamps and self.has_reference else [0.0]
+        #: Time by which the current comes after the motion that it causes, s; negative if the motion comes after it, and after
+        #: the force. Nothing that is looked for explains a path of two times: what is found there is a shadow of that.
+        self.current_late_s: float = max(late, key=abs)
         self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
@@ -316,7 +342,9 @@ class Bench:
         """Channel in which a change shows that shows in ``channel`` where all is measured; None where these logs have none."""
         if channel in ("stiffness", "torque") and not self.has_reference:
             channel = "innovation"
-        return channel if channel in self.channels else None
+        sample_s = max(float(np.median(trial.log.samples["dt"])) for trial in self.trials)
+        late = {"torque": self.current_late_s != 0.0, "stiffness": self.current_late_s < -_FAR * sample_s}
+        return channel if channel in self.channels and not late.get(channel, False) else None
 
     def disturbed(self, disturb: Callable, random: np.random.Generator) -> "Bench":
         """The same logs with samples disturbed: (SAMPLE rows, episode of each, generator) → rows."""

@@ -55,8 +55,15 @@ def select(bench: Bench, progress: Progress) -> Selection:
         selection = one_round(selection)
         if selection.accepted == before:
             break
-    selection = make_terms(selection, lambda text: progress(text, 0.72))
+    found = make_terms(selection, lambda text: progress(text, 0.72))
     progress("refitting what is applied", 0.75)
+    final = _finished(found)
+    if found.accepted == selection.accepted or {*selection.accepted} <= {*final.accepted}:
+        return final
+    return replace(final, instead=_finished(selection))
+
+
+def _finished(selection: Selection) -> Selection:
     return find_changes(revise(recalibrate_heat(selection)))
 
 

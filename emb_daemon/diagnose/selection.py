@@ -50,6 +50,7 @@ class Selection:
         refused: channels whose recalibration was taken out again, with what it gained and why.
         dropped: effects that were accepted and are not to be tried again.
         at_first: what the residual depended on before any effect was accepted, by channel.
+        instead: what was chosen out of the catalogue alone, where some of it gave way to terms.
     """
 
     model: Model
@@ -59,6 +60,7 @@ class Selection:
     refused: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     dropped: frozenset[str] = frozenset()
     at_first: Mapping[str, list[Dependence]] = field(default_factory=dict)
+    instead: "Selection | None" = None
 
     @property
     def accepted(self) -> list[str]:

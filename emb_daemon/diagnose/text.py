@@ -96,7 +96,7 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    parts = (_worse, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    parts = (_worse, _apart, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
 
@@ -104,6 +104,18 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
     """Logs that have lost by what was found, whatever the others gain."""
     logs = [f"{log} ({before:.1f} N → {after:.1f} N)" for log, before, after in diagnosis.worse]
     return [f"Worse on {', '.join(logs)}."] if logs else []
+
+
+def _apart(diagnosis: Diagnosis) -> list[str]:
+    """Current and motion of two times: no cause comes after what it does."""
+    late_ms = 1e3 * diagnosis.bench.current_late_s
+    if not late_ms:
+        return []
+    what, on = f"The current comes {late_ms:.0f} ms after the motion that it causes", "the torque path"
+    if late_ms < 0.0:
+        what = f"Angle and speed come {-late_ms:.0f} ms after the current that moves them"
+        on = on if diagnosis.bench.channel_of("stiffness") else "either path"
+    return [f"{what}: nothing is looked for on {on} until they are of one time."]
 
 
 def _outside(diagnosis: Diagnosis) -> list[str]:

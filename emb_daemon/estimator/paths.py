@@ -8,7 +8,7 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
-from emb_daemon.models.lateness import remember, turned_within
+from emb_daemon.models.lateness import friction_since, remember, turned_within
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
 from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, slid_angle, turned_back, unexplained_torque
 from emb_daemon.wire.contract import CYCLE_S
@@ -212,12 +212,13 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     # that is abrupt passes for an age of up to half a cycle (1.8 ms from 140 rad/s): the speed beside it is a mean around it.
     known = effects.known_delay(p.effects)
     age = known + s.late if s.late > 0.5 * CYCLE_S else known
-    ahead, noise = turned_within(s.lately, age), _CERTAINLY * p.speed_sigma * sqrt(CYCLE_S * abs(age))
-    turning = ahead - min(max(ahead, -noise), noise)
-    slid = _slid(s, p, m.angle + turning, m.angle - s.angle, m.dt)
+    early = turned_within(s.lately, min(age, 0.0))
+    slid = _slid(s, p, m.angle + early, m.angle - s.angle, m.dt)
     s.friction_state, mean, s.friction_variance = friction_state(
         s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
+    if age > 0.0:
+        mean = friction_since(s.lately, s.friction_state, mean, age, _CERTAINLY * p.speed_sigma, p.presliding_angle)
     s.friction_mean = mean
     e, state, mean_speed, angle, travel = p.effects, s.effects, 0.5 * (m.speed + s.speed), m.angle + s.ahead, s.travel
     s.gear_gain = effects.gear_gain(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)

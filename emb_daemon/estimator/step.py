@@ -49,7 +49,7 @@ from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
-from emb_daemon.models.lateness import find_filter, follow, interrupt, stand, unfilter, way_beside
+from emb_daemon.models.lateness import find_filter, follow, interrupt, speed_then, stand, unfilter, way_beside
 from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, believe_resolver, disbelieve_resolver, frozen, watch
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
@@ -224,9 +224,17 @@ def _follow_age(s, p, m, turned, moved_zero):
 def _follow_noise(s, p, m):
     """How noisy the speed is, and how far it is off: a motor that stands has none."""
     if s.plausibility.held > _HELD and m.angle == s.angle:
-        s.speed_square += min(m.dt / _NOISE_S, 1.0) * (s.speed * s.speed - s.speed_square)
+        # An angle that is late still stays where it is while the motor turns.
+        age = s.late + effects.known_delay(p.effects)
+        then = speed_then(s.lately, age)
+        s.speed_square += min(m.dt / _NOISE_S, 1.0) * (then * then - s.speed_square)
         believed = s.plausibility.verdict == AGREE or s.drifting_s > 0.0
-        if believed and p.clearance_sigma > 0.0 and at_rest(s, m) and stand(s.lateness, m.speed, s.speed_sigma):
+        if (
+            believed
+            and p.clearance_sigma > 0.0
+            and at_rest(s, m)
+            and stand(s.lateness, then if age > 0.0 else m.speed, s.speed_sigma)
+        ):
             s.strayed = np.nan
             forget_wander(s.wander)
             if s.drifting_s > 0.0:

@@ -348,24 +348,31 @@ def _least_lag(lags: np.ndarray, left: np.ndarray) -> float:
     return near[np.argmin(np.abs(near))]
 
 
-def _find_late_current(speed: Series, current: Series, force: Series | None) -> list[str]:
-    """A line on a current of another time than the load and the acceleration that it explains."""
-    times = current.time_ns[:_JUDGED]
-    at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
-    columns = np.stack([np.ones(len(times)), load, at, np.sign(at), np.gradient(at, 1e-9 * times)], axis=1)
-    longest_ms = _BESIDE_MOTION_MS if force is None else _BESIDE_LOAD_MS
+def current_late_ms(current: Series, times: np.ndarray, columns: np.ndarray, longest_ms: int) -> int:
+    """Time by which a current comes after what explains it, ``columns`` (n, k) at some ``times`` (ns), negative if before; 0
+    if neither is sure, or it is ``longest_ms`` or more."""
     lags_ms = np.arange(-longest_ms, longest_ms + 1)
     every = len(times) // _COMPARED + 1
     times, columns = times[::every], columns[::every]
     values = np.stack([current.sampled(times + 1_000_000 * lag_ms) for lag_ms in lags_ms.tolist()], axis=1)
     known = np.isfinite(columns).all(axis=1) & np.isfinite(values).all(axis=1)
     if np.sum(known) < _LEAST:
-        return []
+        return 0
     explained, values = np.linalg.qr(columns[known])[0], values[known]
     left_A = np.std(values - explained @ (explained.T @ values), axis=0)
     late_ms, now_A = int(_least_lag(lags_ms, left_A)), left_A[longest_ms]
     # At the end of the search it is no delay but a slow motion, in which all is alike.
-    if not _LEAST_CURRENT_MS <= abs(late_ms) < longest_ms or not now_A > _CURRENT_BETTER * np.min(left_A):
+    sure = _LEAST_CURRENT_MS <= abs(late_ms) < longest_ms and now_A > _CURRENT_BETTER * np.min(left_A)
+    return late_ms if sure else 0
+
+
+def _find_late_current(speed: Series, current: Series, force: Series | None) -> list[str]:
+    """A line on a current of another time than the load and the acceleration that it explains."""
+    times = current.time_ns[:_JUDGED]
+    at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
+    columns = np.stack([np.ones(len(times)), load, at, np.sign(at), np.gradient(at, 1e-9 * times)], axis=1)
+    late_ms = current_late_ms(current, times, columns, _BESIDE_MOTION_MS if force is None else _BESIDE_LOAD_MS)
+    if not late_ms:
         return []
     what, other = ("the acceleration", "are angle and speed") if force is None else ("the load", "is ClampForceRef")
     if late_ms > 0.0:

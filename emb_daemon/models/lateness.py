@@ -13,6 +13,7 @@ from math import copysign, exp, sqrt
 import numpy as np
 
 from emb_daemon.jit import Record, fields, njit
+from emb_daemon.models.torque import friction_state, slid_angle
 from emb_daemon.models.wander import STANDING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -94,6 +95,45 @@ def turned_within(w: Record, age: float) -> float:
         turned += part * (w.speed[here] + 0.5 * (w.speed[before] - w.speed[here]) * part / dt)
         left, here = left - part, before
     return (turned + left * w.speed[here]) * copysign(1.0, age)
+
+
+@njit
+def friction_since(w: Record, state: float, mean: float, age: float, noise: float, presliding_angle: float) -> float:
+    """Mean friction state over the last cycle where the angle is ``age`` s old: from the ``state`` that this has come to, and
+    its ``mean`` over its last cycle, step by step as the speeds turn it over. Those within their ``noise`` rad/s add up to a
+    way once that is more than theirs.
+
+    The state itself follows the angle alone: what noise turns over by mistake is forgotten when the angle has come, and no
+    hold keeps it."""
+    steps, left = 0, age
+    while steps < _KEPT - 2 and left > w.dt[(w.at - steps) % _KEPT] > 0.0:
+        left -= w.dt[(w.at - steps) % _KEPT]
+        steps += 1
+    whole, unsure = steps > 0, noise * sqrt(CYCLE_S * age)
+    way = slid = 0.0
+    while steps >= 0:
+        here = (w.at - steps) % _KEPT
+        dt = w.dt[here]
+        if dt > 0.0:
+            part = min(left, dt)
+            moved = part * (w.speed[here] + 0.5 * (w.speed[(here - 1) % _KEPT] - w.speed[here]) * part / dt)
+            way += moved
+            if abs(w.speed[here]) < noise:
+                moved = slid_angle(slid, way, unsure) - slid
+            slid += moved
+            state, last, _ = friction_state(state, 0.0, moved, presliding_angle, 0.0, dt)
+            mean = last if whole else mean + part / dt * (last - mean)
+        left, steps = np.inf, steps - 1
+    return mean
+
+
+@njit
+def speed_then(w: Record, age: float) -> float:
+    """Speed (rad/s) of the last sample in LATELY that is ``age`` s older than its newest, or more."""
+    here = w.at
+    while age > 0.0 and w.dt[here] > 0.0 and (here - 1) % _KEPT != w.at:
+        age, here = age - w.dt[here], (here - 1) % _KEPT
+    return w.speed[here]
 
 
 @njit

@@ -36,12 +36,13 @@ TRACE = np.dtype(
 
 #: What the force paths take from the rest of the step, at each sample: temperatures (degC) of the pads, ``mean`` and at the
 #: ``surface``, and the ``history`` of their rise (K), friction ``power`` (W), ``disc`` (degC), whether temperatures are known,
-#: and the heat of the motor's winding and housing. ``contact_angle`` (rad) shows whether the zero was lost.
+#: the heat of the motor's winding and housing. Angles (rad) by which the resolver's zero was found to have moved
+#: (``zero_moved``), and the contact angle beside it, which is learned anew from then on (``contact_moved``).
 HEAT = np.dtype(
     [
         ("mean", "f8", (2,)),
         ("surface", "f8", (2,)),
-        *fields("f8", "history power disc winding housing contact_angle"),
+        *fields("f8", "history power disc winding housing zero_moved contact_moved"),
         ("temperature_known", "?"),
     ],
     align=True,
@@ -97,13 +98,15 @@ def _run_step(samples, parameters, states, estimate, out, heat):
     for row in range(len(samples)):
         m, o = samples[row], out[row]
         winding, housing = s.winding, s.housing
+        zero, contact = (s.gear_zero, s.contact_angle) if row > 0 else (m.angle, m.angle + p.clearance)
         step(s, p, m, e)
         if len(heat) > 0:
             h = heat[row]
             h.winding, h.housing = winding, housing
             h.mean[0], h.mean[1] = s.mean[0], s.mean[1]
             h.surface[0], h.surface[1] = s.pads[0, 0], s.pads[1, 0]
-            h.history, h.contact_angle = s.history, s.contact_angle
+            h.history, h.zero_moved = s.history, s.gear_zero - zero
+            h.contact_moved = s.contact_angle - contact - h.zero_moved
             h.power, h.disc, h.temperature_known = s.power, s.disc, s.temperature_known
         factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
         o.torque_constant = p.torque_constant * factor
