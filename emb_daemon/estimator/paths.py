@@ -5,7 +5,7 @@ from math import exp, sqrt
 import numpy as np
 
 from emb_daemon.effects import paths as effects
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
 from emb_daemon.models.lateness import friction_since, remember, turned_within
@@ -21,6 +21,9 @@ DISSOLVING_PER_S = 0.05
 _SELF_LOCKING = 0.2
 #: Standard deviations of the way that noisy speeds add up to from which it is one.
 _CERTAINLY = 3.0
+#: Share of friction's turning over that counts as its standard deviation where it is not known whether the gear slides: of all
+#: or nothing, one being as likely as the other.
+_SLID = 0.5
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
@@ -192,7 +195,8 @@ def _slid(s, p, angle, travel, dt):
     s.turned_back = turned_back(s.turned_back, s.direction, travel, dt)
     if travel != 0.0:
         s.direction = travel
-    if s.straying.creeps:
+    if s.straying.creeps and s.wander.drift != 0.0:
+        # The angle strays: it does not slide the gear, and what friction carries at rest stays unknown.
         s.slid_angle += travel
         return 0.0
     noise = p.presliding_angle if s.turned_back > NOISE_TURNS_BACK else 0.0
@@ -214,9 +218,13 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     age = known + s.late if s.late > 0.5 * CYCLE_S else known
     early = turned_within(s.lately, min(age, 0.0))
     slid = _slid(s, p, m.angle + early, m.angle - s.angle, m.dt)
+    before, variance = s.friction_state, s.friction_variance
     s.friction_state, mean, s.friction_variance = friction_state(
-        s.friction_state, s.friction_variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
+        before, variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
+    if s.straying.creeps and slid != 0.0:
+        # Nor is it known whether an angle that moves while the speed, now and of late, shows nothing has slid it.
+        s.friction_variance = min(sq(sqrt(variance) + _SLID * abs(s.friction_state - before)), 1.0)
     if age > 0.0:
         mean = friction_since(s.lately, s.friction_state, mean, age, _CERTAINLY * p.speed_sigma, p.presliding_angle)
     s.friction_mean = mean

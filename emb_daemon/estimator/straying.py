@@ -28,7 +28,7 @@ _OPEN = 1.0 / 0.5**2
 _KEPT = 0.9
 #: Time over which the speed is smoothed, s; of a motor that stands it is at most the speed's offset and so many standard
 #: deviations of its noise, then as now.
-_SMOOTHED_S, _NOISE = 0.2, 3.0
+_SMOOTHED_S, _NOISE = 0.2, 2.0
 
 
 @njit
@@ -49,8 +49,6 @@ def follow_straying(s: Record, travel: float, speed: float, dt: float) -> None:
     # What is certainly motion counts as just that: a fast stroke would otherwise be remembered for a second.
     most, noise = OFFSET_RAD_PER_S + _NOISE * s.speed_sigma, s.speed_sigma * sqrt(0.5 * dt / _SMOOTHED_S)
     a.speed += (1.0 - exp(-dt / _SMOOTHED_S)) * (min(max(speed, -most), most) - a.speed)
-    # An angle that moves while the speed, now and of late, shows nothing may stray: it does not slide the gear, and what
-    # friction carries at rest stays unknown.
     a.creeps = abs(speed) < most and abs(a.speed) < OFFSET_RAD_PER_S + _NOISE * noise
 
 
