@@ -10,7 +10,7 @@ shown that they are the calibration's; a motor may fade.
 
 from math import exp, sqrt
 
-from emb_daemon.estimator.hypotheses import PRIOR_ODDS
+from emb_daemon.estimator.hypotheses import PRIOR_ODDS, likeliest
 from emb_daemon.estimator.unknown import DRIFT_SCALE, GAIN_JUMP, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
 from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import GAIN, INERTIA, SCALE
@@ -28,6 +28,8 @@ PADS_ODDS, OTHERS_ODDS = exp(-2.0), exp(-3.5)
 _PADS_SIGMA, _PADS_SHARE = (0.0, DRIFT_SCALE, SCALE_JUMP), (1.0, 1.0, OTHERS_ODDS / PADS_ODDS)
 #: Kind that is another unit, after the combinations of the three; least error of a calibration's stiffness, share.
 _UNIT, _LEAST = 12, 1e-4
+#: Time after which the common share is weighed again within a stop, s: a stroke.
+_FOLLOWED_S = 0.5
 
 
 @njit
@@ -84,15 +86,35 @@ def forget_common(s: Record) -> None:
 
 
 @njit
+def _weighed(s, p, x, P, pads_odds, rotor_odds, unit_odds):
+    """`common_variance` of a hypothesis with the errors ``x`` and their covariance ``P``."""
+    own = P[SCALE, SCALE] + sq(max(p.stiffness_relative_sigma, _LEAST))
+    stiffness = s.scale * (1.0 + x[SCALE]) - 1.0
+    return common_variance(stiffness, x[GAIN], x[INERTIA], own, P[INERTIA, INERTIA], pads_odds, rotor_odds, unit_odds)
+
+
+@njit
 def weigh_common(s: Record, p: Record) -> None:
-    """Take in what the first hypothesis believes now."""
-    stiffness, gain, inertia = s.scale - 1.0, s.error[GAIN], s.error[INERTIA]
-    own = s.covariance[SCALE, SCALE] + sq(max(p.stiffness_relative_sigma, _LEAST))
-    rotor_variance = s.covariance[INERTIA, INERTIA]
-    _, pads, rotor, unit = common_variance(stiffness, gain, inertia, own, rotor_variance, PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS)
+    """Take in what the first hypothesis believes after a stop."""
+    x, P = s.error, s.covariance
+    _, pads, rotor, unit = _weighed(s, p, x, P, PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS)
     s.pads_odds = max(min(s.pads_odds, pads), exp(PRIOR_ODDS))
     s.rotor_odds, s.unit_odds = min(s.rotor_odds, rotor), min(s.unit_odds, unit)
-    s.common, _, _, _ = common_variance(stiffness, gain, inertia, own, rotor_variance, s.pads_odds, s.rotor_odds, s.unit_odds)
+    s.common, _, _, _ = _weighed(s, p, x, P, s.pads_odds, s.rotor_odds, s.unit_odds)
+
+
+@njit
+def follow_common(s: Record, p: Record, dt: float) -> None:
+    """What the likeliest hypothesis believes within a stop, now and then: it may last, and be the first. What speaks against
+    others counts at its end."""
+    s.common_age_s += dt
+    if s.common_age_s > _FOLLOWED_S:
+        s.common_age_s = 0.0
+        x, P, a = s.error, s.covariance, likeliest(s)
+        if a.log_odds > 0.0:
+            x, P = a.error, a.covariance
+        common, _, _, _ = _weighed(s, p, x, P, s.pads_odds, s.rotor_odds, s.unit_odds)
+        s.common = max(s.common, common)
 
 
 @njit

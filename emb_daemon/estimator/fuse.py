@@ -6,7 +6,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator import uneven
-from emb_daemon.estimator.common import common_sigma, weigh_common
+from emb_daemon.estimator.common import common_sigma, follow_common, weigh_common
 from emb_daemon.estimator.consistency import forget, model_error, remember
 from emb_daemon.estimator.force_sensor import hear_sensor
 from emb_daemon.estimator.hypotheses import (
@@ -312,6 +312,8 @@ def fuse(
         if s.stops > stops:
             weigh_common(s, p)
             attribute_straying(s)
+        elif trusted and s.contact.engaged:
+            follow_common(s, p, m.dt)
     else:
         s.torque_age += m.dt
     s.current_before, s.had_current = m.current_q, m.has_current

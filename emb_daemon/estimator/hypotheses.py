@@ -271,7 +271,8 @@ def _become_first(s, a):
 
 
 @njit
-def _likeliest(s):
+def likeliest(s: Record) -> Record:
+    """The alternative with the highest odds, a drift apart."""
     best = 0
     for i in range(1, DRIFT):
         if s.alternatives[i].log_odds > s.alternatives[best].log_odds:
@@ -490,7 +491,7 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
         s.stops += 1.0
     for i in range(0 if released else DRIFT):
         s.alternatives[i].age_s += dt
-    a = _likeliest(s)
+    a = likeliest(s)
     margin = _CLEARLY if a.age_s < _AMBIGUOUS_S else 0.0
     # Expected jumps need as much evidence as others, because otherwise one false jump would lead to the next.
     evidence = a.log_odds - a.prior > PROVEN - PRIOR_ODDS
