@@ -972,3 +972,20 @@ def test_a_contact_may_drift_as_fast_as_a_disc_grows_once_something_has_certainl
     assert walks[1, SCALE] == walks[0, SCALE]
     if turning:
         assert np.sqrt(walks[1, CONTACT]) * p["gear_gain"] == pytest.approx(80e-6, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("factor", "share"), [(0.9, 0.2), (1.0, 0.0), (1.12, 0.2)])
+def test_a_first_stop_that_lasts_does_not_tell_a_torque_constant_from_pads(p, factor, seed, share):
+    """Pads that are a tenth softer are likelier than a motor that is a tenth stronger, and what moves slowly shows nothing of
+    the rotor, which could tell. Before, nine tenths of such a training lay beyond three sigma."""
+    true = p.copy()
+    true["torque_constant"] *= factor
+    begin, held = np.linspace(0.0, p["clearance"] + 12.0, 1500), p["clearance"] + 9.0
+    angle = np.concatenate((np.zeros(500), begin, held + 3.0 * np.cos(np.pi / 1000.0 * np.arange(6000))))
+    rows, force = brake.samples(true, angle)
+    estimates = estimate(brake.noisy(rows, p, seed), p)
+    clamped = force > 2000.0
+    off, sigma = np.abs(estimates["force"] - force)[clamped], estimates["sigma"][clamped]
+    assert np.mean(off > 3.0 * sigma) <= share
+    assert factor != 1.0 or np.mean(sigma) < 60.0

@@ -28,6 +28,8 @@ PADS_ODDS, OTHERS_ODDS = exp(-2.0), exp(-3.5)
 _PADS_SIGMA, _PADS_SHARE = (0.0, DRIFT_SCALE, SCALE_JUMP), (1.0, 1.0, OTHERS_ODDS / PADS_ODDS)
 #: Kind that is another unit, after the combinations of the three; least error of a calibration's stiffness, share.
 _UNIT, _LEAST = 12, 1e-4
+#: Least share of what is known of the inertia that motion has shown.
+_UNSHOWN = 1e-3
 #: Time after which the common share is weighed again within a stop, s: a stroke.
 _FOLLOWED_S = 0.5
 
@@ -90,7 +92,10 @@ def _weighed(s, p, x, P, pads_odds, rotor_odds, unit_odds):
     """`common_variance` of a hypothesis with the errors ``x`` and their covariance ``P``."""
     own = P[SCALE, SCALE] + sq(max(p.stiffness_relative_sigma, _LEAST))
     stiffness = s.scale * (1.0 + x[SCALE]) - 1.0
-    return common_variance(stiffness, x[GAIN], x[INERTIA], own, P[INERTIA, INERTIA], pads_odds, rotor_odds, unit_odds)
+    # Of the inertia what motion has shown: a prior that is believed is no evidence that the rotor is the calibration's.
+    shown = max(1.0 - P[INERTIA, INERTIA] / sq(INERTIA_SIGMA), _UNSHOWN)
+    rotor, unsure = x[INERTIA] / shown, P[INERTIA, INERTIA] / shown
+    return common_variance(stiffness, x[GAIN], rotor, own, unsure, pads_odds, rotor_odds, unit_odds)
 
 
 @njit
