@@ -10,7 +10,7 @@ shown that they are the calibration's; a motor may fade.
 
 from math import exp, sqrt
 
-from emb_daemon.estimator.hypotheses import PRIOR_ODDS, likeliest
+from emb_daemon.estimator.hypotheses import PRIOR_ODDS, PROVEN, likeliest
 from emb_daemon.estimator.unknown import DRIFT_SCALE, GAIN_JUMP, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
 from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import GAIN, INERTIA, SCALE
@@ -84,7 +84,8 @@ def _to_odds(part, total):
 @njit
 def forget_common(s: Record) -> None:
     """Nothing is known of pads, rotor and unit but the calibration."""
-    s.common, s.pads_odds, s.rotor_odds, s.unit_odds = 0.0, PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS
+    s.common = s.common_before = 0.0
+    s.pads_odds, s.rotor_odds, s.unit_odds = PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS
 
 
 @njit
@@ -105,21 +106,20 @@ def weigh_common(s: Record, p: Record) -> None:
     _, pads, rotor, unit = _weighed(s, p, x, P, PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS)
     s.pads_odds = max(min(s.pads_odds, pads), exp(PRIOR_ODDS))
     s.rotor_odds, s.unit_odds = min(s.rotor_odds, rotor), min(s.unit_odds, unit)
-    s.common, _, _, _ = _weighed(s, p, x, P, s.pads_odds, s.rotor_odds, s.unit_odds)
+    s.common_before, _, _, _ = _weighed(s, p, x, P, s.pads_odds, s.rotor_odds, s.unit_odds)
+    s.common = s.common_before
 
 
 @njit
 def follow_common(s: Record, p: Record, dt: float) -> None:
-    """What the likeliest hypothesis believes within a stop, now and then: it may last, and be the first. What speaks against
-    others counts at its end."""
+    """What a change believes that is proven but for the release, now and then within a stop: it may last, and be the first.
+    What speaks against others counts at its end."""
     s.common_age_s += dt
     if s.common_age_s > _FOLLOWED_S:
-        s.common_age_s = 0.0
-        x, P, a = s.error, s.covariance, likeliest(s)
-        if a.log_odds > 0.0:
-            x, P = a.error, a.covariance
-        common, _, _, _ = _weighed(s, p, x, P, s.pads_odds, s.rotor_odds, s.unit_odds)
-        s.common = max(s.common, common)
+        s.common_age_s, s.common, a = 0.0, s.common_before, likeliest(s)
+        if a.log_odds > PROVEN:
+            common, _, _, _ = _weighed(s, p, a.error, a.covariance, s.pads_odds, s.rotor_odds, s.unit_odds)
+            s.common = max(s.common_before, common)
 
 
 @njit

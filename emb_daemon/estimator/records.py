@@ -135,9 +135,9 @@ STATE = np.dtype(
         # Whether the pads have touched since the last release; stops so far, and proven jumps of the stiffness path.
         ("braked", "?"),
         *fields("f8", "stops jumps"),
-        # Mean square of the share that stiffness, motor and inertia may have in common, and when it was weighed; least odds so
-        # far that pads, rotor and unit are not the calibration's.
-        *fields("f8", "common common_age_s pads_odds rotor_odds unit_odds"),
+        # Mean square of the share that stiffness, motor and inertia may have in common, the same after the last stop, and when
+        # it was weighed within one; least odds so far that pads, rotor and unit are not the calibration's.
+        *fields("f8", "common common_before common_age_s pads_odds rotor_odds unit_odds"),
         # Offset of the torque when the pads last touched (N m), for how long ago (s; 0: never), and what it walks, N2 m2/s.
         *fields("f8", "offset_before offset_age_s offset_walk"),
         # The same of the contact angle beside its anchor, as long as that stays, rad and rad2/s, and its variance then, rad2.
