@@ -198,7 +198,7 @@ def test_the_simulated_car_speaks_as_the_rig_and_is_read_back_alike(tmp_path):
 
 def test_simulate_and_monitor_take_a_mapping(tmp_path, capsys):
     """The car on the rig's bus, its force sensor beside what a daemon broadcasts."""
-    mapping = foreignkit.write_rig(tmp_path)
+    mapping, threads = foreignkit.write_rig(tmp_path), threading.active_count()
     listening = can.Bus(interface="virtual", channel="rigs", fd=True)
     bus = ["-i", "virtual", "-c", "rigs", "--mapping", str(mapping)]
     monitor = ReferenceBus(listening, Mapping(mapping), Listener().ids)
@@ -217,7 +217,7 @@ def test_simulate_and_monitor_take_a_mapping(tmp_path, capsys):
         left.shutdown()
     assert main(["monitor", "--once", "-i", "virtual", "--mapping", str(_columns(tmp_path))]) == 2
     assert "expected one with `dbc` for a live bus" in capsys.readouterr().err
-    assert threading.active_count() < 10
+    assert threading.active_count() <= threads
 
 
 def _columns(folder):
