@@ -365,9 +365,8 @@ def test_a_phase_that_nothing_tells_is_no_thickness_but_a_doubt():
     assert np.abs(change[1700:]).max() < 1.0
     sigmas = [estimate(samples, with_effect("disc_thickness_variation", order_1_cosine_um=um))["sigma"] for um in (15.0, 0.0)]
     held = np.arange(len(samples)) > 2100
-    # Both have doubts of this rough drive in common, and the other one a moment's of its own.
-    more = np.sqrt(np.maximum(sigmas[0] ** 2 - sigmas[1] ** 2, 0.0))[held]
-    assert np.mean(more > 200.0) > 0.95 and sigmas[0][held].min() > 300.0
+    # Both have doubts of this rough drive in common.
+    assert np.all(np.sqrt(np.maximum(sigmas[0] ** 2 - sigmas[1] ** 2, 0.0))[held] > 200.0)
 
 
 def test_a_caliper_keeps_its_temperature_when_its_thermocouple_is_lost():

@@ -202,8 +202,7 @@ def test_sigma_follows_a_contact_that_moves_while_the_motor_holds():
     time_s = 1e-9 * estimates["time_ns"] - moments["park"]
     held = (time_s > 5.0) & (time_s < 30.0)
     off = np.abs(estimates["force"] - force_N)[held]
-    ratio = off / estimates["sigma"][held]
-    assert off.max() > 4000.0 and ratio.max() < 4.0 and np.mean(ratio > 3.0) < 0.15
+    assert off.max() > 4000.0 and np.max(off / estimates["sigma"][held]) < 3.5
 
 
 def test_another_brake_has_its_share_of_forces_and_of_sizes(plant):

@@ -222,8 +222,9 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     s.friction_state, mean, s.friction_variance = friction_state(
         before, variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
-    if s.straying.creeps and slid != 0.0:
-        # Nor is it known whether an angle that moves while the speed, now and of late, shows nothing has slid it.
+    if s.straying.creeps and slid != 0.0 and s.past_contact < 0.0:
+        # Nor is it known whether an angle that moves while the speed, now and of late, shows nothing has slid it: nothing
+        # drives the motor of an open brake, while that of a closed one follows pads and disc.
         s.friction_variance = min(sq(sqrt(variance) + _SLID * abs(s.friction_state - before)), 1.0)
     if age > 0.0:
         mean = friction_since(s.lately, s.friction_state, mean, age, _CERTAINLY * p.speed_sigma, p.presliding_angle)

@@ -28,7 +28,7 @@ _OPEN = 1.0 / 0.5**2
 _KEPT = 0.9
 #: Time over which the speed is smoothed, s; of a motor that stands it is at most the speed's offset and so many standard
 #: deviations of its noise, then as now.
-_SMOOTHED_S, _NOISE = 0.2, 2.0
+_SMOOTHED_S, _NOISE = 0.2, 3.0
 
 
 @njit
