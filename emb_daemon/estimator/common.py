@@ -11,13 +11,12 @@ shown that they are the calibration's; a motor may fade.
 from math import exp, sqrt
 
 from emb_daemon.estimator.hypotheses import PRIOR_ODDS, PROVEN, likeliest
-from emb_daemon.estimator.unknown import DRIFT_SCALE, GAIN_JUMP, GAIN_SIGMA, INERTIA_SIGMA, SCALE_JUMP
+from emb_daemon.estimator.unknown import DRIFT_SCALE, GAIN_JUMP, GAIN_SIGMA, INERTIA_REACH, INERTIA_SIGMA, SCALE_JUMP
 from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import GAIN, INERTIA, SCALE
 
-#: Inertia of another unit of one drawing; torque constant of magnets that have lost strength or of a wrong current sensor,
-#: shares (as in `adapt.fit`).
-_ANOTHER_ROTOR, _ANOTHER_MOTOR = 0.1, 0.1
+#: Torque constant of magnets that have lost strength or of a wrong current sensor, share (as in `adapt.fit`).
+_ANOTHER_MOTOR = 0.1
 #: Odds that pads differ from the calibration's in small ways, and that motor, rotor or a whole unit are others, as those of
 #: the hypotheses (`estimator.hypotheses`): one in eight, and one of 34. Of 444 phases that `studies.silent grid` draws
 #: (--faults nominal,pads_thickness,pads_compound,tolerance,torque_constant,current_gain,gear_wear --count 10, seeds 22 and
@@ -59,7 +58,7 @@ def common_variance(
             odds, gain_sigma = unit_odds, GAIN_JUMP
         a = 1.0 / (stiffness_variance + _PADS_SIGMA[pads] * _PADS_SIGMA[pads])
         b = 1.0 / (gain_sigma * gain_sigma)
-        c = 1.0 / (inertia_variance + sq(_ANOTHER_ROTOR if rotor else INERTIA_SIGMA))
+        c = 1.0 / (inertia_variance + sq(INERTIA_REACH if rotor else INERTIA_SIGMA))
         information = a + b + c
         mean = -(a * stiffness + b * gain + c * inertia) / information
         cost = a * stiffness * stiffness + b * gain * gain + c * inertia * inertia - information * mean * mean

@@ -172,8 +172,8 @@ def _open(s, p, kind):
         add_creep(a.covariance)
     else:
         add_drift(a.covariance, p)
-    faded = abs(s.error[FADE]) * s.winding + abs(s.error[HOUSING]) * s.housing
-    stay_possible(a.error, a.covariance, s.gain, p, s.contact_angle - s.contact_anchor, s.scale, s.growth, s.creep, faded)
+    distance = s.contact_angle - s.contact_anchor
+    stay_possible(a.error, a.covariance, s.gain, p, distance, s.scale, s.growth, s.creep, s.winding, s.housing)
     a.least, a.prior = _least_odds(s, kind), _first_odds(s, kind)
     a.log_odds = a.prior
     if p.clearance_sigma == 0.0:

@@ -40,7 +40,9 @@ from emb_daemon.estimator.unknown import (
     LEAST_SCALE,
     MOST_CREEP,
     MOST_SCALE,
+    WARM_C,
     add_softening,
+    excess,
     set_friction,
     set_priors,
     softening_sigma,
@@ -64,6 +66,8 @@ _LED = 0.2
 _HELD, _NOISE_S = 25, 0.5
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
+#: Standard deviations within which a stiffness is at its bound.
+_CERTAINLY = 3.0
 #: Factor on the calibration's largest force above which no clamp force is possible.
 _POSSIBLE = 1.3
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
@@ -268,7 +272,11 @@ def _look(s, p, m, facts, out):
         facts |= WHEEL_CONTRADICTED
     if s.wander.found and p.clearance_sigma > 0.0:
         facts |= ZERO_WANDERS
-    if not LEAST_SCALE < s.scale < MOST_SCALE or max(abs(s.creep[0]), abs(s.creep[1])) >= MOST_CREEP:
+    more = excess(s.error, p, m.caliper if s.temperature_known else WARM_C, s.winding, s.housing)
+    out.sigma *= more
+    unsure = min(_CERTAINLY * sqrt(s.covariance[SCALE, SCALE]), 1.0)
+    at_bound = s.scale * (1.0 - unsure) <= LEAST_SCALE or s.scale * (1.0 + unsure) >= MOST_SCALE
+    if more > 1.0 or at_bound or max(abs(s.creep[0]), abs(s.creep[1])) >= MOST_CREEP:
         facts |= BOUND_REACHED
     if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
         facts |= BEYOND_RANGE
