@@ -40,6 +40,7 @@ from emb_daemon.estimator.hypotheses import (
     weigh,
 )
 from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.status import BOUND_REACHED
 from emb_daemon.estimator.unknown import add_drift_walks, set_priors, torque_offset
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -989,3 +990,14 @@ def test_a_first_stop_that_lasts_does_not_tell_a_torque_constant_from_pads(p, fa
     off, sigma = np.abs(estimates["force"] - force)[clamped], estimates["sigma"][clamped]
     assert np.mean(off > 3.0 * sigma) <= share
     assert factor != 1.0 or np.mean(sigma) < 60.0
+
+
+def test_friction_that_gives_energy_is_told(p):
+    """A torque that helps at speed is no friction, whatever else explains the same force."""
+    path = brake.stops(p, 12, 3)
+    rows, _ = brake.samples(p, path)
+    plain = estimate(brake.noisy(rows, p), p)
+    rows["current_q"] -= 10.0 * p["offset_friction"] / p["maximum_speed"] / p["torque_constant"] * rows["speed"]
+    helped = estimate(brake.noisy(rows, p), p)
+    assert not np.any(plain["facts"] & BOUND_REACHED)
+    assert np.mean(helped["facts"][len(path) // 4 :] & BOUND_REACHED != 0) > 0.95

@@ -15,6 +15,7 @@ from emb_daemon.estimator import status
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import TABLE, names, tell_status
 from emb_daemon.estimator.step import _look, predict
+from emb_daemon.models.fusion import COULOMB, FADE, GAIN, INERTIA, LOAD, SCALE, SLOW, VISCOUS
 from emb_daemon.wire import contract as r
 
 #: Reasons that frames, bus and clock give, outside the estimator. test_faults.py, test_faults_loop.py, test_hostile.py raise
@@ -83,7 +84,7 @@ class _Seen:
         self.p, self.state, self.sample, self.out = p, new_state(), np.zeros(1, SAMPLE), np.zeros(1, ESTIMATE)
         self.state["temperature_known"], self.state["scale"] = True, 1.0
         self.state["monitor"]["high"] = p["maximum_force"]
-        self.sample["dt"] = 0.004
+        self.sample["dt"], self.sample["caliper"] = 0.004, 20.0
         self.out["force"], self.out["sigma"] = 5000.0, 40.0
 
     def facts(self, samples=1, before=0):
@@ -122,6 +123,51 @@ def test_stuck_thermocouple_and_contradicted_wheel(seen):
 def test_a_learned_value_at_its_bound(seen, name, value):
     seen.state[name] = value
     assert seen.facts() == {"bound_reached"}
+
+
+@pytest.mark.parametrize("scale", [0.35, 2.6])
+def test_a_stiffness_that_may_be_beyond_its_bound_by_chance_is_at_it(seen, scale):
+    """Pads of which a piece has broken off looked 0.309 +- 0.018 as stiff, 1 kN wrong, and were not told to be at a bound."""
+    seen.state["scale"], seen.state["covariance"][0, SCALE, SCALE] = scale, 0.04**2
+    assert seen.facts() == set()
+    seen.state["covariance"][0, SCALE, SCALE] = 0.06**2
+    assert seen.facts() == {"bound_reached"}
+
+
+#: How far motor and friction can be from the calibration, one standard deviation.
+_REACHES = {
+    GAIN: lambda p: 0.05,
+    INERTIA: lambda p: 0.1,
+    SLOW: lambda p: 0.5,
+    LOAD: lambda p: np.hypot(p["load_friction"], p["torque_relative_sigma"] * p["gear_gain"]),
+    COULOMB: lambda p: 2.0 * p["offset_friction"],
+    VISCOUS: lambda p: 2.0 * p["offset_friction"] / p["maximum_speed"],
+}
+
+
+@pytest.mark.parametrize("state", _REACHES)
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_motor_and_friction_that_no_such_brake_has_are_told_and_count(seen, state, sign):
+    """Up to three times what a brake can be off by nothing happens; beyond, sigma grows by what chance does not explain."""
+    reach = sign * _REACHES[state](seen.p)
+    seen.state["error"][0, state] = 2.95 * reach
+    assert seen.facts() == set() and seen.out["sigma"][0] == 40.0
+    seen.state["error"][0, state] = 5.0 * reach
+    assert seen.facts() == {"bound_reached"} and seen.out["sigma"][0] == pytest.approx(40.0 * np.sqrt(1.0 + 25.0 - 9.0))
+
+
+def test_grease_of_a_cold_caliper_may_be_as_thick_as_it_gets(seen):
+    seen.state["error"][0, VISCOUS] = 12.0 * _REACHES[VISCOUS](seen.p)
+    assert "bound_reached" in seen.facts()
+    seen.out["sigma"], seen.sample["caliper"] = 40.0, -20.0
+    assert seen.facts() == set()
+
+
+def test_a_motor_may_be_as_much_weaker_as_its_heat_explains(seen):
+    seen.state["error"][0, GAIN] = -0.3
+    assert seen.facts() == {"bound_reached"}
+    seen.out["sigma"], seen.state["error"][0, FADE], seen.state["winding"] = 40.0, -0.2, 0.5
+    assert seen.facts() == set()
 
 
 @pytest.mark.parametrize("largest_N, limit_N", [(30e3, 300.0), (45e3, 450.0), (16e3, 300.0), (10e3, 200.0)])

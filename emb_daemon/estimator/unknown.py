@@ -77,8 +77,9 @@ _MISSED, _MISSED_S = 0.3, 10.0
 #: How far a brake can be from its calibration at all, one standard deviation: contact angle (worn pads, a released position
 #: that moved), m; stiffness (thinnest pads, another compound), creep and motor torque, shares.
 _CONTACT_REACH_M, _SCALE_REACH, _CREEP_REACH, _GAIN_REACH = 100e-6, 0.3, 0.1, 0.05
-#: The same of the inertia: another rotor of one drawing, share (as in `adapt.fit`).
-INERTIA_REACH = 0.1
+#: The same of the inertia: another rotor of one drawing, share (as in `adapt.fit`); and of the speed torque of a warm gear at
+#: full speed over its Coulomb torque: half of what the thickest of those greases makes of the thinnest's.
+INERTIA_REACH, _VISCOUS_REACH = 0.1, 2.0
 #: Standard deviations of how far a brake can be from its calibration beyond which it is not: what motor and friction then seem
 #: to be is something else, which no hypothesis contains. In 378 drives with faults of sensors and bus (`studies.silent
 #: injected --count 3 --seed 9` on three recorded logs) 16 of the 21 s with silent errors over 1 kN are beyond three, and 0.4 %
@@ -252,7 +253,7 @@ def excess(x: Floats, p: Record, caliper: float, winding: float, housing: float)
         far = max(far, abs(x[LOAD]) / load)
     if p.offset_friction > 0.0:
         coulomb = thick * p.offset_friction
-        viscous = abs(x[VISCOUS]) * p.maximum_speed / _VISCOUS_JUMP
+        viscous = abs(x[VISCOUS]) * p.maximum_speed / _VISCOUS_REACH
         far = max(far, 0.5 * abs(x[COULOMB]) / coulomb, viscous / coulomb)
     return sqrt(max(1.0 + far * far - _IMPOSSIBLE * _IMPOSSIBLE, 1.0))
 
