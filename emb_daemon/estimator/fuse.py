@@ -31,7 +31,7 @@ from emb_daemon.estimator.hypotheses import (
     unproven,
     weigh,
 )
-from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, crept
+from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, crept, disc_warmth
 from emb_daemon.estimator.status import (
     ANGLE_LATE,
     CONTACT_LOST,
@@ -278,7 +278,7 @@ def fuse(
 
     Returns the standard deviation of the torque (N m) but for what is not known of the friction state, of a motor that turns
     and of one that stands; infinite without a torque."""
-    warmth = s.disc - s.growth_start if s.temperature_known else 0.0
+    warmth = disc_warmth(s)
     known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p, m)
     _predict(s, p, m, spread, warmth, known)
     uneven.turn(s.uneven, m, s.drive_slope, p.gear_gain, p.relaxation_time)

@@ -52,6 +52,12 @@ def turned(s: Record, p: Record, angle: float) -> tuple[float, float]:
 
 
 @njit
+def disc_warmth(s: Record) -> float:
+    """How much warmer the disc is than when its growth began to count, K."""
+    return s.disc - s.growth_start if s.temperature_known else 0.0
+
+
+@njit
 def position(s: Record, p: Record, m: Record) -> float:
     """Equivalent angle past contact at this sample, rad; advances the effects that act on it."""
     e, state, before = p.effects, s.effects, s.angle + s.ahead
@@ -60,7 +66,7 @@ def position(s: Record, p: Record, m: Record) -> float:
     s.travel = m.angle + s.ahead - before
     effects.look(e.terms, s, p, m)
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
-    grown = s.growth * (s.disc - s.growth_start) if s.temperature_known else 0.0
+    grown = s.growth * disc_warmth(s)
     late = turned_within(s.lately, s.late)
     angle, s.gear_slope = turned(s, p, m.angle + late + effects.motor_angle(e, state, m, s.lately, m.dt))
     return angle + gained / p.gear_gain + grown - s.contact_angle
@@ -164,6 +170,8 @@ def shift_zero(s: Record, moved: float) -> None:
     s.contact_anchor += moved
     s.start_angle += moved
     s.gear_zero += moved
+    for i in range(len(s.learned)):
+        s.learned[i].contact_angle += moved
 
 
 @njit

@@ -7,6 +7,7 @@ from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.force_sensor import FORCE_SENSOR, FORCE_SENSOR_PARAMETERS
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.monitor import MONITOR
+from emb_daemon.estimator.rewind import LEARNED, STOPS
 from emb_daemon.estimator.straying import STRAYING
 from emb_daemon.estimator.uneven import UNEVEN
 from emb_daemon.estimator.wheel import WHEEL
@@ -132,6 +133,8 @@ STATE = np.dtype(
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
+        # What was known after each of the last stops, the oldest first.
+        ("learned", LEARNED, (STOPS,)),
         # Whether the pads have touched since the last release; stops so far, and proven jumps of the stiffness path.
         ("braked", "?"),
         *fields("f8", "stops jumps"),

@@ -77,12 +77,13 @@ ALIGNMENT = np.dtype(
 
 
 @njit
-def align(a: Record, m: Record) -> None:
+def align(a: Record, m: Record) -> bool:
     """Replace motion or current of SAMPLE ``m``, whichever is early, by what belongs to the other, and a filtered current by
-    what went into its filter."""
+    what went into its filter. Returns whether they are apart by something else from now on."""
     _keep(a, m)
     a.unsettled = max(a.unsettled - 1.0, 0.0)
-    if out_of_step(a) and _range(a.angle) < _STANDS_RAD:
+    found = out_of_step(a) and _range(a.angle) < _STANDS_RAD
+    if found:
         a.delay = min(max(a.delay + a.delay_left, -EARLIEST), LATEST)
         a.lag = min(max(a.lag + a.lag_left, -SLOWEST), SLOWEST)
         _forget(a)
@@ -91,6 +92,7 @@ def align(a: Record, m: Record) -> None:
     elif a.delay < 0.0:
         m.current_q = _at(a.age, a.current, -a.delay * CYCLE_S)
     _filter(a, m)
+    return found
 
 
 @njit

@@ -1,0 +1,70 @@
+"""Going back to what was known some stops ago, when a fault of the signals is found that may have been there since.
+
+A current or an angle that comes late, or through a filter, is found after a few strokes, and undone. What these strokes have
+taught of contact, pads, motor and friction was wrong: a current that is filtered by 5 ms has passed for pads half as stiff
+again.
+"""
+
+import numpy as np
+
+from emb_daemon.estimator.hypotheses import fold, open_all
+from emb_daemon.jit import Record, njit
+from emb_daemon.models.fusion import CONTACT, CREEPS, GROWTH, OFFSET, SCALE, STATES, copy_errors
+
+#: Stops to go back: a filter shows in one to three.
+STOPS = 3
+
+#: What was known at the end of a stop: the first hypothesis's errors and their covariance, and what the model had taken over.
+LEARNED = np.dtype(
+    [
+        ("error", "f8", (STATES,)),
+        ("covariance", "f8", (STATES, STATES)),
+        *((name, "f8") for name in ("contact_angle", "scale", "growth", "jumps", "contact_walk")),
+        ("creep", "f8", (len(CREEPS),)),
+    ],
+    align=True,
+)
+
+
+@njit
+def _copy(a, s):
+    copy_errors(a.error, a.covariance, s.error, s.covariance)
+    a.contact_angle, a.scale, a.growth, a.jumps = s.contact_angle, s.scale, s.growth, s.jumps
+    a.contact_walk = s.contact_walk
+    for i in range(len(CREEPS)):
+        a.creep[i] = s.creep[i]
+
+
+@njit
+def keep_all(s: Record) -> None:
+    """Nothing was learned before."""
+    for i in range(STOPS):
+        _copy(s.learned[i], s)
+
+
+@njit
+def keep(s: Record) -> None:
+    """Keep what is known at the end of a stop."""
+    for i in range(STOPS - 1):
+        _copy(s.learned[i], s.learned[i + 1])
+    _copy(s.learned[STOPS - 1], s)
+
+
+@njit
+def go_back(s: Record, p: Record, warmth: float) -> None:
+    """Know what was known some stops ago, and suspect nothing."""
+    a = s.learned[0]
+    # Neither a delay nor a filter changes what the clearance shows of the offset.
+    offset, variance = s.error[OFFSET], s.covariance[OFFSET, OFFSET]
+    copy_errors(s.error, s.covariance, a.error, a.covariance)
+    for i in range(STATES):
+        s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
+    s.error[OFFSET], s.covariance[OFFSET, OFFSET] = offset, variance
+    s.error[CONTACT], s.error[SCALE] = a.contact_angle - s.contact_angle, a.scale / s.scale - 1.0
+    s.error[GROWTH] = a.growth - s.growth
+    for i in range(len(CREEPS)):
+        s.error[CREEPS[i]] = a.creep[i] - s.creep[i]
+    fold(s, warmth, True)
+    s.jumps, s.contact_walk, s.contact_age_s = a.jumps, a.contact_walk, 0.0
+    keep_all(s)
+    open_all(s, p)

@@ -1,0 +1,96 @@
+"""Going back: what strokes with a late or filtered signal have taught is not kept once that is found."""
+
+import brake
+import city
+import numpy as np
+import pytest
+
+from emb_daemon.estimator.hypotheses import PRIOR_ODDS, STIFFNESS_JUMP, TORQUE_JUMP
+from emb_daemon.estimator.paths import shift_zero
+from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.rewind import STOPS, go_back, keep, keep_all
+from emb_daemon.models.fusion import CONTACT, CREEPS, OFFSET, SCALE, VISCOUS
+from emb_daemon.offline import estimate
+
+
+@pytest.fixture
+def s(parameters):
+    """The state of a brake after some stops."""
+    p, state = brake.ideal(parameters), new_state()
+    estimate(brake.noisy(brake.samples(p, brake.stops(p, 3))[0], p), p, state)
+    keep_all(state[0])
+    return state[0]
+
+
+def _learn(s, by):
+    """The brake seems to change by ``by`` steps, and not to have changed before."""
+    s["contact_angle"] += 0.5 * by
+    s["scale"] += 0.1 * by
+    s["growth"] += 1e-4 * by
+    s["creep"][:] += 0.01 * by
+    s["jumps"] += by
+    s["error"][VISCOUS] += 1e-3 * by
+    s["covariance"][VISCOUS, VISCOUS] *= 1.0 + by
+
+
+def _known(s):
+    return [*(float(s[name]) for name in ("contact_angle", "scale", "growth", "jumps")), *s["creep"], s["error"][VISCOUS]]
+
+
+@pytest.mark.parametrize("cycles", [2.0, 5.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_filter_that_the_current_comes_through_while_driving_leaves_nothing_behind(parameters, seed, cycles):
+    """Eight milliseconds have passed for pads a quarter stiffer: 0.5 to 0.9 kN were left for good, at a stated 33 N."""
+    samples, force = city.drive(seed, 80.0)
+    plain, samples = estimate(samples, parameters), samples.copy()
+    half = len(samples) // 2
+    state = new_state()
+    current = samples["current_q"][half:]
+    for row in range(1, len(current)):
+        current[row] = current[row - 1] + (current[row] - current[row - 1]) / (1.0 + cycles)
+    later = slice(len(samples) - 2500, None)
+    error = (estimate(samples, parameters, state)["force"] - force)[later]
+    assert state[0]["alignment"]["lag"] > 1.0 and state[0]["scale"] == pytest.approx(1.0, abs=0.005)
+    assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean((plain["force"] - force)[later] ** 2)) + 25.0
+
+
+def test_what_was_known_some_stops_ago_is_known_again(parameters, s):
+    known, variance = _known(s), float(s["covariance"][VISCOUS, VISCOUS])
+    for by in range(1, STOPS):
+        _learn(s, float(by))
+        keep(s)
+    s["alternatives"]["log_odds"] = 50.0
+    go_back(s, brake.ideal(parameters), 10.0)
+    assert _known(s) == pytest.approx(known)
+    assert s["error"][[CONTACT, SCALE, *CREEPS]] == pytest.approx(0.0) and s["covariance"][VISCOUS, VISCOUS] == variance
+    # Nothing is suspected, and what was learned meanwhile is not gone back to.
+    assert np.all(s["alternatives"]["log_odds"][[STIFFNESS_JUMP, TORQUE_JUMP]] <= PRIOR_ODDS)
+    _learn(s, 1.0)
+    go_back(s, brake.ideal(parameters), 10.0)
+    assert _known(s) == pytest.approx(known)
+
+
+def test_no_more_stops_are_gone_back_than_a_fault_takes_to_be_found(parameters, s):
+    _learn(s, 1.0)
+    known = _known(s)
+    for by in range(STOPS):
+        keep(s)
+        _learn(s, 1.0 + by)
+    go_back(s, brake.ideal(parameters), 0.0)
+    assert _known(s) == pytest.approx(known)
+
+
+def test_what_the_clearance_shows_of_the_offset_is_kept(parameters, s):
+    """It does not change quickly, so that neither a delay nor a filter matters."""
+    s["error"][OFFSET], s["covariance"][OFFSET, OFFSET] = 0.3, 0.01**2
+    go_back(s, brake.ideal(parameters), 0.0)
+    assert s["error"][OFFSET] == 0.3 and s["covariance"][OFFSET, OFFSET] == 0.01**2
+    assert np.all(np.linalg.eigvalsh(s["covariance"]) > -1e-12)
+
+
+def test_a_zero_that_moves_moves_what_is_gone_back_to(parameters, s):
+    contact = float(s["contact_angle"])
+    shift_zero(s, 2.0)
+    _learn(s, 1.0)
+    go_back(s, brake.ideal(parameters), 0.0)
+    assert s["contact_angle"] == pytest.approx(contact + 2.0)
