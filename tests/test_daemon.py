@@ -176,6 +176,17 @@ def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp
         assert messages[-1] == b"STOPPING=1"
 
 
+def test_a_ping_that_was_withheld_is_made_up_for_soon(setup: Setup, monkeypatch):
+    """A loop that only stalled is not ended for it: a quarter of the time to the next ping."""
+    asked, manager = [], ServiceManager(environment={})
+    manager.watchdog_s = 5.0
+    monkeypatch.setattr(Daemon, "_ping", lambda _: asked.append(time.monotonic()) or len(asked) > 1)
+    with Running(setup, manager) as running:
+        running.wait_for(lambda _: len(asked) == 3)
+    again, then = np.diff(asked)
+    assert 0.4 < again < then
+
+
 def test_the_service_manager_is_told_the_state_again_and_again(setup: Setup, monkeypatch):
     monkeypatch.setattr("emb_daemon.runtime.daemon._STATUS_NS", 20_000_000)
     manager, told = ServiceManager(environment={}), []

@@ -57,6 +57,7 @@ def test_standstill_forgets_and_sliding_knows():
         assert mean == state == 1.0
     assert np.all(np.diff(standing) > 0.0)
     assert standing[-1] == pytest.approx(0.3, rel=0.01)
+    assert friction_state(1.0, 0.9, 0.0, _PRESLIDING, 0.05, 60.0)[2] == 1.0, "more than nothing cannot be forgotten"
 
 
 def _frictions(rows, p, late_s):

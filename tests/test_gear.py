@@ -83,6 +83,8 @@ def test_the_table_is_met_at_its_points_and_rises_between(shipped):
     assert slopes[inside] == pytest.approx(0.75 * (1.0 + np.exp(-fine[inside] / 12.0)), rel=0.02)
     assert [back_through_gear(gear, x) for x in turned_rad] == pytest.approx(fine, abs=1e-6)
     assert steepest(gear) == pytest.approx((slopes.min(), slopes.max()), rel=1e-3)
+    few = ramp(shipped, 4).motor.gear()
+    assert np.gradient(few["turned"], few["step"])[1:-1] == pytest.approx(few["slope"][1:-1], rel=3e-3)
 
 
 def test_a_constant_gear_is_told_to_the_bit_by_its_angle(shipped):

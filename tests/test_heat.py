@@ -4,6 +4,7 @@ import naive
 import numpy as np
 import pytest
 
+from emb_daemon.estimator.heat import heat
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, heat_step, mean_temperature
 from emb_daemon.offline import estimate
@@ -139,6 +140,15 @@ def test_without_heating_nothing_leaves_the_range_of_its_surroundings(thermal, d
         low, high = min(pads.min(), disc, 20.0), max(pads.max(), disc)
         disc = heat_step(thermal, pads, disc, 20.0, 20.0, 20.0, 0.0, step % 2 == 0, 10.0, dt, work, LONGEST_S, UNALTERED)
         assert low - 1e-9 <= min(pads.min(), disc) and max(pads.max(), disc) <= high + 1e-9
+
+
+@pytest.mark.parametrize(("torque_Nm", "power_W"), [(500.0, 25_000.0), (0.2, 10.0), (-3.0, 0.0)])
+def test_the_torque_that_is_measured_heats_and_its_noise_below_zero_does_not(parameters, torque_Nm, power_W):
+    s, m = new_state()[0], np.zeros(1, SAMPLE)[0]
+    s["temperature_known"], s["fused"] = True, 5000.0
+    m["dt"], m["brake_torque"], m["wheel_speed"], m["has_wheel_speed"] = 0.004, torque_Nm, 50.0, True
+    heat(s, parameters[0], m)
+    assert s["power"] == pytest.approx(power_W)
 
 
 def test_pads_forget_their_temperature_over_the_time_of_the_calibration(parameters):
