@@ -370,7 +370,7 @@ def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
     values[20] -= 12.0 * prints[5]
     centre, readings = _read(values, prints, factors)
     found = population.outliers(values - centre, readings)
-    assert {(one.where, one.cause) for one in found} == {(10, 2), (20, 5)}
+    assert {(one.where, one.cause): one.amount for one in found} == pytest.approx({(10, 2): 12.0, (20, 5): -12.0}, rel=0.2)
     # Were its own drives as far apart, it would be none.
     centre, readings = _read(values, prints, factors, noise=20.0)
     assert population.outliers(values - centre, readings) == []
@@ -447,16 +447,17 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
 
 
 def test_who_asks_twice_as_many_questions_is_half_as_sure():
-    """The same causes listed twice tell nothing new of anybody."""
+    """The same causes listed twice tell nothing new of anybody: each is its twin's rival."""
     values, prints, groups, factors = _fleet(np.random.default_rng(3))
     values[10] += 12.0 * prints[2]
     values[groups["batch 1"]] += 3.0 * prints[4]
-    chances = []
-    for causes in (prints, np.concatenate([prints, prints])):
+    chances, count = [], len(prints)
+    for causes, rivals in ((prints, ((), ())), (np.concatenate([prints, prints]), ((2 + count,), (4 + count,)))):
         centre, readings = _read(values, causes, factors)
         [unit] = [one for one in population.outliers(values - centre, readings) if one.where == 10]
         batch = population.shared_causes(values, groups, readings, beside=True)[0]
         chances.append((unit.chance, batch.chance))
+        assert (unit.rivals, batch.rivals) == rivals
     np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
     assert min(chances[0]) > 0.0
 
