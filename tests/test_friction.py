@@ -175,6 +175,7 @@ def test_an_angle_that_is_noise_is_told_by_its_turning_back():
     assert _shares(np.zeros(100)).max() == 0.0
     one = _shares([1.0, 0.0, 0.0, -1.0, -1.0])
     assert one[3] == 0.0 and one[4] == pytest.approx(0.08) and one[5] < one[4]
+    assert _shares([1.0, -1.0], dt=9.0)[2] == 1.0, "after a gap only the last sample counts"
 
 
 @pytest.mark.parametrize("noisy", [True, False])

@@ -151,6 +151,13 @@ def test_the_torque_that_is_measured_heats_and_its_noise_below_zero_does_not(par
     assert s["power"] == pytest.approx(power_W)
 
 
+def test_pads_take_no_more_than_all_the_heat(thermal):
+    """However much of it effects send there."""
+    pads, work, all_of_it = np.full((2, NODES), 20.0), np.empty((4, CHAIN)), UNALTERED._replace(heat_share=99.0)
+    disc = heat_step(thermal, pads, 20.0, 20.0, 20.0, 20.0, 9000.0, False, 0.0, 0.5, work, LONGEST_S, all_of_it)
+    assert pads[0, 0] > 30.0 and disc == pytest.approx(20.0, abs=0.1)
+
+
 def test_pads_forget_their_temperature_over_the_time_of_the_calibration(parameters):
     rows, state = np.zeros(10_000, SAMPLE), new_state()
     rows["dt"][1:], rows["angle"], rows["brake_torque"] = 0.004, 17.5, np.nan

@@ -272,7 +272,8 @@ def test_after_a_restart_pads_and_disc_have_cooled_for_as_long_as_they_rested(p,
     s, snapshot, out, first = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0], np.zeros(1, ESTIMATE)[0], _standing(p)[0][0]
     step(s, p, first, out)
     s["disc"], s["pads"], s["history"], p["thermal"]["history_time"] = 200.0, 200.0, 50.0, 100.0
-    assert restart.take_snapshot(s, p, snapshot)
+    s["contact_angle"] += 0.1
+    assert restart.take_snapshot(s, p, snapshot) and snapshot["clearance"] == pytest.approx(p["clearance"] + 0.1)
     resumed = new_state()[0]
     restart.resume(resumed, p, snapshot, elapsed_s)
     assert resumed["error"][FAST] == resumed["error"][NOISE] == 0.0, "of the moment alone"
