@@ -154,8 +154,8 @@ def test_the_torque_that_is_measured_heats_and_its_noise_below_zero_does_not(par
 def test_pads_take_no_more_than_all_the_heat(thermal):
     """However much of it effects send there."""
     pads, work, all_of_it = np.full((2, NODES), 20.0), np.empty((4, CHAIN)), UNALTERED._replace(heat_share=99.0)
-    disc = heat_step(thermal, pads, 20.0, 20.0, 20.0, 20.0, 9000.0, False, 0.0, 0.5, work, LONGEST_S, all_of_it)
-    assert pads[0, 0] > 30.0 and disc == pytest.approx(20.0, abs=0.1)
+    disc = heat_step(thermal, pads, 20.0, 20.0, 20.0, 20.0, 9000.0, False, 0.0, 0.004, work, LONGEST_S, all_of_it)
+    assert min(pads.min(), disc) > 20.0 - 1e-9 and pads[0, 0] > 25.0
 
 
 def test_pads_forget_their_temperature_over_the_time_of_the_calibration(parameters):
