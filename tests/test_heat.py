@@ -6,7 +6,7 @@ import pytest
 
 from emb_daemon.estimator.heat import heat
 from emb_daemon.estimator.records import SAMPLE, new_state
-from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, heat_step, mean_temperature
+from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, friction_power, heat_step, mean_temperature
 from emb_daemon.offline import estimate
 
 
@@ -142,12 +142,15 @@ def test_without_heating_nothing_leaves_the_range_of_its_surroundings(thermal, d
         assert low - 1e-9 <= min(pads.min(), disc) and max(pads.max(), disc) <= high + 1e-9
 
 
-@pytest.mark.parametrize(("torque_Nm", "power_W"), [(500.0, 25_000.0), (0.2, 10.0), (-3.0, 0.0)])
+@pytest.mark.parametrize(("torque_Nm", "power_W"), [(500.0, 25_000.0), (0.2, 10.0), (-3.0, 0.0), (np.nan, None)])
 def test_the_torque_that_is_measured_heats_and_its_noise_below_zero_does_not(parameters, torque_Nm, power_W):
+    """Without a measurement the friction does that pads of their mean surface temperature have."""
     s, m = new_state()[0], np.zeros(1, SAMPLE)[0]
     s["temperature_known"], s["fused"] = True, 5000.0
     m["dt"], m["brake_torque"], m["wheel_speed"], m["has_wheel_speed"] = 0.004, torque_Nm, 50.0, True
+    s["pads"][0], s["pads"][1], thermal = 100.0, 500.0, parameters[0]["thermal"]
     heat(s, parameters[0], m)
+    power_W = friction_power(thermal, 5000.0, 50.0, 300.0) if power_W is None else power_W
     assert s["power"] == pytest.approx(power_W)
 
 

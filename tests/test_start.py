@@ -277,6 +277,7 @@ def test_after_a_restart_pads_and_disc_have_cooled_for_as_long_as_they_rested(p,
     resumed = new_state()[0]
     restart.resume(resumed, p, snapshot, elapsed_s)
     assert resumed["error"][FAST] == resumed["error"][NOISE] == 0.0, "of the moment alone"
+    assert (resumed["temperature_sigma"] - s["temperature_sigma"] > 10.0) == (elapsed_s > 100.0)
     step(resumed, p, first, out)
     assert resumed["disc"] == pytest.approx(disc, abs=0.5) and resumed["mean"] == pytest.approx([pads, pads], abs=0.5)
     rise = 200.0 - p["thermal"]["reference"]
