@@ -310,3 +310,10 @@ def test_nothing_is_compiled_once_the_loop_runs(setup: Setup, drive, tmp_path: P
     (tmp_path / "state").mkdir()
     done = processkit.python("-c", _COMPILES_NOTHING, *arguments)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("late", "missed"), [(0.9, 0), (1.0, 1), (1.9, 1), (2.5, 2)])
+def test_each_whole_period_that_a_tick_is_late_is_a_missed_one(setup: Setup, late, missed):
+    daemon, pacer = Daemon(setup, socket_pair()[0]), Pacer(0)
+    daemon._count(pacer.last_tick_ns + round((1.0 + late) * CYCLE_NS), pacer)
+    assert (daemon.ticks, daemon.missed) == (1, missed)
