@@ -154,6 +154,16 @@ def test_the_torque_that_is_measured_heats_and_its_noise_below_zero_does_not(par
     assert s["power"] == pytest.approx(power_W)
 
 
+def test_a_speed_that_nothing_tells_heats_nothing_and_may_have_heated(parameters):
+    """As at 110 km/h, by the friction of pads of their mean surface temperature."""
+    s, m, thermal = new_state()[0], np.zeros(1, SAMPLE)[0], parameters[0]["thermal"]
+    s["temperature_known"], s["fused"], s["pads"][0], s["pads"][1] = True, 5000.0, 100.0, 500.0
+    m["dt"], m["brake_torque"] = 0.004, np.nan
+    heat(s, parameters[0], m)
+    may_have = friction_power(thermal, 5000.0, 100.0, 300.0) * 0.004 / thermal["disc_heat_capacity"]
+    assert s["power"] == 0.0 and s["temperature_sigma"] == pytest.approx(may_have)
+
+
 def test_pads_take_no_more_than_all_the_heat(thermal):
     """However much of it effects send there."""
     pads, work, all_of_it = np.full((2, NODES), 20.0), np.empty((4, CHAIN)), UNALTERED._replace(heat_share=99.0)
