@@ -22,7 +22,7 @@ from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps.torque import fit_torque
 from emb_daemon.logs.write import write_frames
 from emb_daemon.models.gear import all_through_gear, back_through_gear, most_of_spring, steepest, through_gear
-from emb_daemon.models.stiffness import characteristic_curve
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.brake import equivalent_angle, motor_angle
@@ -140,6 +140,14 @@ def test_a_release_spring_takes_torque_and_is_no_clamp_force(shipped, tmp_path):
     assert torque_over_force(log, shipped) > 1.15
     found = estimate(log.samples, to_parameters(sprung))
     assert np.mean(np.abs(found["force"] - log.force_N) < 2.0 * np.hypot(found["sigma"], 25.0)) > 0.93
+
+
+def test_the_most_that_a_release_spring_takes_is_at_full_clamp(parameters):
+    """30 N/mm over the way from the released position."""
+    p = parameters[0]
+    assert most_of_spring(p) == 0.0
+    p["spring"], way_rad = 30e3, p["clearance"] + travel_at(p["maximum_force"], p["curve"])
+    assert most_of_spring(p) == pytest.approx(30e3 * p["gear_gain"] * way_rad)
 
 
 @pytest.mark.parametrize("spring", [0.0, 5e6])
