@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from emb_daemon.estimator.heat import heat
+from emb_daemon.estimator.heat import _watch_plates, heat
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, friction_power, heat_step, mean_temperature
 from emb_daemon.offline import estimate
@@ -162,6 +162,18 @@ def test_a_speed_that_nothing_tells_heats_nothing_and_may_have_heated(parameters
     heat(s, parameters[0], m)
     may_have = friction_power(thermal, 5000.0, 100.0, 300.0) * 0.004 / thermal["disc_heat_capacity"]
     assert s["power"] == 0.0 and s["temperature_sigma"] == pytest.approx(may_have)
+
+
+def test_a_plate_that_repeats_is_stuck_once_heat_has_had_the_time_to_come_through_the_pad(parameters):
+    """That is L²/(4 a), of a mean that has moved by 20 K."""
+    s, m, thermal = new_state()[0], np.zeros(1, SAMPLE)[0], parameters[0]["thermal"]
+    thermal["conductivity"] = 3.0
+    takes_s = thermal["thickness"] ** 2 / (4.0 * _diffusivity(thermal))
+    s["plate"], s["plate_mean"], s["mean"] = 20.0, 20.0, 40.0
+    m["inner_backplate"], m["outer_backplate"], m["has_thermocouple"] = 20.0, 20.0, True
+    for share, stuck in ((0.95, False), (0.1, True)):
+        _watch_plates(s, thermal, m, share * takes_s)
+        assert s["plate_stuck"] == stuck
 
 
 def test_pads_take_no_more_than_all_the_heat(thermal):
