@@ -12,11 +12,8 @@ _UNKNOWN_SIZE = 1 << 20
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """Content of a regular file; never blocks.
-
-    Raises:
-        OSError: not readable, not a regular file, or larger than ``most_bytes``; ``strerror`` says which.
-    """
+    """Content of a regular file; never blocks. Raises OSError: not readable, not a regular file, or larger than
+    ``most_bytes``; ``strerror`` says which."""
     # open() of a pipe would wait for a writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:

@@ -1,4 +1,6 @@
-"""The error that a user sees: one line that says where and what was expected."""
+"""What a user sees on standard error: one line that says where and what was expected."""
+
+import sys
 
 
 class InputError(Exception):
@@ -24,3 +26,8 @@ class InvalidValue(InputError, ValueError):
 class Unavailable(Exception):
     """Something outside of the program, such as a CAN interface, is missing now and may be there later. The command line
     prints it and ends with exit status 1, after which a service manager tries again."""
+
+
+def tell(text: str) -> None:
+    """Print a line for a person to standard error."""
+    print(text, file=sys.stderr)

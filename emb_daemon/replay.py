@@ -53,11 +53,7 @@ class Result:
         return _shares(self.estimates["facts"], TABLE)
 
     def since(self, time_ns: int) -> "Result":
-        """The part from ``time_ns`` on the log's clock on.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The part from ``time_ns`` on the log's clock on. Raises InputError: there is none."""
         rows = self.time_ns >= time_ns
         if not rows.any():
             raise InputError(f"{self.path}: ends before --from")
@@ -167,11 +163,8 @@ class Replay:
             yield sent[sent["time_ns"] >= since]
 
     def run(self, path: Path) -> Result:
-        """Replay one log; returns the result of the first corner.
-
-        Raises:
-            InputError: unreadable, or without a usable resolver sample of a corner.
-        """
+        """Replay one log; returns the result of the first corner. Raises InputError: unreadable, or without a usable resolver
+        sample of a corner."""
         return self.run_corners(path)[0]
 
     def run_corners(self, path: Path) -> list[Result]:

@@ -417,7 +417,7 @@ def _contribution_error(bench: Bench, kind: str, hidden: dict, found: dict) -> f
 
 def what_is_left(result: Diagnosis, plant: np.void, schedule: Schedule, seed: int) -> dict[str, Rest]:
     """Remaining error by path, compared with the log that the unit leaves with nothing hidden, its ``plant``."""
-    plain = Model.of(Bench([log_of(simulate_log(plant, schedule, seed=seed)[0])], result.original))
+    plain = Model.of(Bench([log_of(simulate_log(plant, schedule, seed=seed)[0])], result.bench.calibration))
     fitted = plain.refined(FORCE_CHANNELS)
     judges = result.judges.under(result.calibration)
     all_three = (judges, judges.residuals({})), (plain.bench, plain.residual), (fitted.bench, fitted.residual)

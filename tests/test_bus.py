@@ -2,6 +2,9 @@
 
 import argparse
 import os
+import socket
+import struct
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -13,6 +16,7 @@ from emb_daemon.calibration.configuration import Bus
 from emb_daemon.cli.options import add_bus_arguments, bus_options
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.bus import open_bus
+from emb_daemon.runtime.rawcan import _bound_socket
 from emb_daemon.wire.frames import ERROR, FRAME
 
 #: Of its own for each run, so that two test runs on one machine do not hear each other.
@@ -161,3 +165,14 @@ def test_can_conf_counts_where_nothing_else_is_said(monkeypatch):
         theirs.send(can.Message(arbitration_id=0x100, is_extended_id=False, data=bytes(8)))
         assert _heard(bus, 1) == [(0x100, 0)]
     bus.close()
+
+
+def test_the_kernel_lets_through_what_is_ours_and_nothing_else(monkeypatch):
+    """A filter passes a frame whose id is the filter's in the bits of its mask."""
+    told, none = {}, SimpleNamespace(setsockopt=lambda _, option, value: told.update({option: value}), bind=lambda _: None)
+    monkeypatch.setattr("emb_daemon.runtime.rawcan.socket.socket", lambda *_: none)
+    _bound_socket("can0", _OURS, 1 << 20)
+    filters = list(struct.iter_unpack("=II", told[socket.CAN_RAW_FILTER]))
+    flagged = (can_id | flag for can_id in range(0x800) for flag in (0, socket.CAN_EFF_FLAG, socket.CAN_RTR_FLAG))
+    passed = {can_id for can_id in flagged if any(can_id & mask == own & mask for own, mask in filters)}
+    assert passed == set(_OURS)

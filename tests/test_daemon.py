@@ -176,6 +176,17 @@ def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp
         assert messages[-1] == b"STOPPING=1"
 
 
+def test_a_ping_that_was_withheld_is_made_up_for_soon(setup: Setup, monkeypatch):
+    """A loop that only stalled is not ended for it: a quarter of the time to the next ping."""
+    asked, manager = [], ServiceManager(environment={})
+    manager.watchdog_s = 5.0
+    monkeypatch.setattr(Daemon, "_ping", lambda _: asked.append(time.monotonic()) or len(asked) > 1)
+    with Running(setup, manager) as running:
+        running.wait_for(lambda _: len(asked) == 3)
+    again, then = np.diff(asked)
+    assert 0.4 < again < then
+
+
 def test_the_service_manager_is_told_the_state_again_and_again(setup: Setup, monkeypatch):
     monkeypatch.setattr("emb_daemon.runtime.daemon._STATUS_NS", 20_000_000)
     manager, told = ServiceManager(environment={}), []
@@ -299,3 +310,10 @@ def test_nothing_is_compiled_once_the_loop_runs(setup: Setup, drive, tmp_path: P
     (tmp_path / "state").mkdir()
     done = processkit.python("-c", _COMPILES_NOTHING, *arguments)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("late", "missed"), [(0.9, 0), (1.0, 1), (1.9, 1), (2.5, 2)])
+def test_each_whole_period_that_a_tick_is_late_is_a_missed_one(setup: Setup, late, missed):
+    daemon, pacer = Daemon(setup, socket_pair()[0]), Pacer(0)
+    daemon._count(pacer.last_tick_ns + round((1.0 + late) * CYCLE_NS), pacer)
+    assert (daemon.ticks, daemon.missed) == (1, missed)

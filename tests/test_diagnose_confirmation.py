@@ -206,11 +206,11 @@ def test_a_recalibration_that_validation_logs_refuse_is_said(calibration, judged
 
     monkeypatch.setattr(confirmation, "_veto", against_torque)
     result = judged(another)
-    assert result.calibration.motor == result.original.motor
+    assert result.calibration.motor == result.bench.calibration.motor
     [(channel, refused)] = report(result)["not_recalibrated"].items()
     assert channel == "torque" and refused["gain_N"] > 100.0 and refused["reason"] == "withdrawn: it is worse there"
     assert "Not recalibrated: the torque path, which would gain" in verdict(result)
-    there = rms_known(result.initial["torque"], result.bench.means("torque", LASTING["torque"]))
+    there = rms_known(result.selection.screening.initial["torque"], result.bench.means("torque", LASTING["torque"]))
     assert result.left["torque"].present and result.left["torque"].rms == pytest.approx(there)
     of_another = rms_known(result.judges.residuals({})["torque"], result.judges.means("torque", LASTING["torque"]))
     assert of_another < 0.3 * there
@@ -270,7 +270,7 @@ def test_noise_with_which_the_validation_logs_get_worse_is_not_written(viscous, 
     monkeypatch.setattr(diagnosis, "_with_noise", lambda calibration, selection: moved(calibration, worthless))
     result = judged(viscous[2])
     assert [finding.effect.name for finding in result.accepted] == ["viscous_friction"]
-    assert result.calibration.noise.stiffness_N == result.original.noise.stiffness_N
+    assert result.calibration.noise.stiffness_N == result.bench.calibration.noise.stiffness_N
     assert result.after.rmse("fused") <= 1.05 * result.before.rmse("fused")
 
 

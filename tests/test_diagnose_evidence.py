@@ -125,6 +125,8 @@ def test_evidence_is_what_its_definition_gives():
     np.testing.assert_allclose(fit.without, without, rtol=1e-6)
     np.testing.assert_allclose(fit.left_out, errors, rtol=1e-6)
     np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-5)
+    in_thousands = leave_out(Moments.of(table, 1e-3 * target, episode, 9).select(columns), penalty[columns])
+    np.testing.assert_allclose(in_thousands.covariance, 1e-6 * covariance, rtol=1e-5)
     own = (
         table[:, candidate]
         - table[:, nuisances]

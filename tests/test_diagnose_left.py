@@ -37,10 +37,11 @@ def test_the_page_tells_what_is_left_where_it_has_nothing_to_draw_it_over(channe
     """Temperatures have times of their own, and the motor's heat only the estimator has."""
     left = Left(channel, 3.0, 1.0, 0.5, (Dependence(channel, signal, 0.3, 2.0, 4.0, True),))
     samples, columns = np.ones(900), {"disc_temperature": np.ones(500)}
-    told = SimpleNamespace(
-        left={channel: left}, residual={channel: samples}, initial={channel: samples}, signals=columns,
-        left_before={}, unexplained=left, bench=SimpleNamespace(own_data=False),
+    selection = SimpleNamespace(
+        screening=SimpleNamespace(initial={channel: samples}, signals=columns), at_first={},
+        model=SimpleNamespace(residual={channel: samples}),
     )  # fmt: skip
+    told = SimpleNamespace(left={channel: left}, selection=selection, unexplained=left, bench=SimpleNamespace(own_data=False))
     written = Page("", "")
     _left(written, told)
     assert signal.replace("_", " ") in written.render()
@@ -83,7 +84,8 @@ def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibrati
     # Half of it, as a mean is no change, and more where friction helps the brake to open.
     assert 0.05 < result.calibration.noise.torque_lasting < 0.12
     assert "Some stops leave the torque off" in verdict(result)
-    assert result.left["torque"].beyond and rmse(result.residual["torque"]) < 1.5 * calibration.provenance.achieved["torque_N"]
+    achieved = calibration.provenance.achieved["torque_N"]
+    assert result.left["torque"].beyond and rmse(result.selection.model.residual["torque"]) < 1.5 * achieved
     stated = moved(calibration, {"noise.torque_lasting": 0.3})
     assert diagnose([log], stated).calibration.noise.torque_lasting == 0.3
     # Of one log among others it is said, too.

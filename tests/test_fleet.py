@@ -332,7 +332,7 @@ def test_what_a_batch_shares_is_found_with_its_cause_and_size():
         values[groups["batch 1"]] += 3.0 * prints[4]
         values[groups["batch 2"]] -= 2.0 * prints[7]
         found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
-        assert {(one.group, one.cause) for one in found} == {("batch 1", 4), ("batch 2", 7)}
+        assert {(one.where, one.cause) for one in found} == {("batch 1", 4), ("batch 2", 7)}
         for one in found:
             truth = 3.0 if one.cause == 4 else -2.0
             assert abs(one.amount - truth) < 5.0 * one.sigma
@@ -349,7 +349,7 @@ def test_what_a_wrong_shape_leaves_is_no_second_cause():
             prints[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
             values[groups["batch 1"]] += prints[4] + second * prints[9]
             found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
-            assert {one.cause for one in found} == named and {one.group for one in found} == {"batch 1"}, (seed, second)
+            assert {one.cause for one in found} == named and {one.where for one in found} == {"batch 1"}, (seed, second)
 
 
 def test_where_nothing_is_shared_nobody_is_accused():
@@ -370,7 +370,7 @@ def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
     values[20] -= 12.0 * prints[5]
     centre, readings = _read(values, prints, factors)
     found = population.outliers(values - centre, readings)
-    assert {(one.row, one.cause) for one in found} == {(10, 2), (20, 5)}
+    assert {(one.where, one.cause): one.amount for one in found} == pytest.approx({(10, 2): 12.0, (20, 5): -12.0}, rel=0.2)
     # Were its own drives as far apart, it would be none.
     centre, readings = _read(values, prints, factors, noise=20.0)
     assert population.outliers(values - centre, readings) == []
@@ -398,10 +398,10 @@ def test_what_a_workshop_could_not_confirm_is_not_reported(monkeypatch):
     own = object.__new__(findings._Study)
     own.keys, own.masks = [("a", "FL"), ("b", "FL")], {"batch A": np.ones(2, bool)}
     own.causes, own.directions = [SimpleNamespace(name="", key="", shape="", unit="")], SimpleNamespace(size_N=np.ones(1))
-    found = [population.Outlier(row, 0, size_N, 1.0, 1e-9, ()) for row, size_N in enumerate((-35.0, -37.0))]
+    found = [population.Difference(row, 0, size_N, 1.0, 1e-9, ()) for row, size_N in enumerate((-35.0, -37.0))]
     monkeypatch.setattr(findings, "outliers", lambda *_: found)
     assert [one.where for one in own._outliers(np.zeros(0), None, lambda _: "")] == ["b FL"]
-    shared = [population.Shared("batch A", 0, size_N, 1.0, 1e-9, 1e-9, ()) for size_N in (9.0, -11.0)]
+    shared = [population.Difference("batch A", 0, size_N, 1.0, 1e-9, ()) for size_N in (9.0, -11.0)]
     assert [one.size_N for one in own._list_shared(shared, lambda _: "")] == [-11.0]
 
 
@@ -447,16 +447,17 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
 
 
 def test_who_asks_twice_as_many_questions_is_half_as_sure():
-    """The same causes listed twice tell nothing new of anybody."""
+    """The same causes listed twice tell nothing new of anybody: each is its twin's rival."""
     values, prints, groups, factors = _fleet(np.random.default_rng(3))
     values[10] += 12.0 * prints[2]
     values[groups["batch 1"]] += 3.0 * prints[4]
-    chances = []
-    for causes in (prints, np.concatenate([prints, prints])):
+    chances, count = [], len(prints)
+    for causes, rivals in ((prints, ((), ())), (np.concatenate([prints, prints]), ((2 + count,), (4 + count,)))):
         centre, readings = _read(values, causes, factors)
-        [unit] = [one for one in population.outliers(values - centre, readings) if one.row == 10]
+        [unit] = [one for one in population.outliers(values - centre, readings) if one.where == 10]
         batch = population.shared_causes(values, groups, readings, beside=True)[0]
         chances.append((unit.chance, batch.chance))
+        assert (unit.rivals, batch.rivals) == rivals
     np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
     assert min(chances[0]) > 0.0
 

@@ -16,7 +16,9 @@ from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames, read_log
 from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
+from emb_daemon.resources import resource
 from emb_daemon.wire.frames import EXTENDED, REMOTE
+from emb_daemon.wire.layout import load_database
 
 _THEIR_DBC = """VERSION ""
 BU_: RIG
@@ -580,3 +582,12 @@ def test_a_measurement_has_units_comments_and_texts(log, tmp_path):
                 assert [text.decode() for text in signal.samples] == list(expected)
             stamps = file.header.start_time.timestamp() + signal.timestamps
             np.testing.assert_allclose(stamps, columns["time_s"].to_numpy(), rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", ["kcd", "sym"])
+def test_a_bus_may_be_described_in_other_formats(tmp_path, ending):
+    known = load_database(resource("dbc/emb.dbc"))
+    path = tmp_path / f"emb.{ending}"
+    path.write_text(getattr(known, f"as_{ending}_string")())
+    found = load_database(path)
+    assert {message.name: message.frame_id for message in found.messages} == {m.name: m.frame_id for m in known.messages}

@@ -57,6 +57,7 @@ def test_standstill_forgets_and_sliding_knows():
         assert mean == state == 1.0
     assert np.all(np.diff(standing) > 0.0)
     assert standing[-1] == pytest.approx(0.3, rel=0.01)
+    assert friction_state(1.0, 0.9, 0.0, _PRESLIDING, 0.05, 60.0)[2] == 1.0, "more than nothing cannot be forgotten"
 
 
 def _frictions(rows, p, late_s):
@@ -174,6 +175,7 @@ def test_an_angle_that_is_noise_is_told_by_its_turning_back():
     assert _shares(np.zeros(100)).max() == 0.0
     one = _shares([1.0, 0.0, 0.0, -1.0, -1.0])
     assert one[3] == 0.0 and one[4] == pytest.approx(0.08) and one[5] < one[4]
+    assert _shares([1.0, -1.0], dt=9.0)[2] == 1.0, "after a gap only the last sample counts"
 
 
 @pytest.mark.parametrize("noisy", [True, False])

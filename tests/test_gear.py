@@ -22,7 +22,7 @@ from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps.torque import fit_torque
 from emb_daemon.logs.write import write_frames
 from emb_daemon.models.gear import all_through_gear, back_through_gear, most_of_spring, steepest, through_gear
-from emb_daemon.models.stiffness import characteristic_curve
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.brake import equivalent_angle, motor_angle
@@ -83,6 +83,8 @@ def test_the_table_is_met_at_its_points_and_rises_between(shipped):
     assert slopes[inside] == pytest.approx(0.75 * (1.0 + np.exp(-fine[inside] / 12.0)), rel=0.02)
     assert [back_through_gear(gear, x) for x in turned_rad] == pytest.approx(fine, abs=1e-6)
     assert steepest(gear) == pytest.approx((slopes.min(), slopes.max()), rel=1e-3)
+    few = ramp(shipped, 4).motor.gear()
+    assert np.gradient(few["turned"], few["step"])[1:-1] == pytest.approx(few["slope"][1:-1], rel=3e-3)
 
 
 def test_a_constant_gear_is_told_to_the_bit_by_its_angle(shipped):
@@ -138,6 +140,14 @@ def test_a_release_spring_takes_torque_and_is_no_clamp_force(shipped, tmp_path):
     assert torque_over_force(log, shipped) > 1.15
     found = estimate(log.samples, to_parameters(sprung))
     assert np.mean(np.abs(found["force"] - log.force_N) < 2.0 * np.hypot(found["sigma"], 25.0)) > 0.93
+
+
+def test_the_most_that_a_release_spring_takes_is_at_full_clamp(parameters):
+    """30 N/mm over the way from the released position."""
+    p = parameters[0]
+    assert most_of_spring(p) == 0.0
+    p["spring"], way_rad = 30e3, p["clearance"] + travel_at(p["maximum_force"], p["curve"])
+    assert most_of_spring(p) == pytest.approx(30e3 * p["gear_gain"] * way_rad)
 
 
 @pytest.mark.parametrize("spring", [0.0, 5e6])

@@ -4,8 +4,9 @@ import naive
 import numpy as np
 import pytest
 
+from emb_daemon.estimator.heat import _watch_plates, heat
 from emb_daemon.estimator.records import SAMPLE, new_state
-from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, heat_step, mean_temperature
+from emb_daemon.models.thermal import CHAIN, LONGEST_S, NODES, UNALTERED, at_depth, friction_power, heat_step, mean_temperature
 from emb_daemon.offline import estimate
 
 
@@ -139,6 +140,47 @@ def test_without_heating_nothing_leaves_the_range_of_its_surroundings(thermal, d
         low, high = min(pads.min(), disc, 20.0), max(pads.max(), disc)
         disc = heat_step(thermal, pads, disc, 20.0, 20.0, 20.0, 0.0, step % 2 == 0, 10.0, dt, work, LONGEST_S, UNALTERED)
         assert low - 1e-9 <= min(pads.min(), disc) and max(pads.max(), disc) <= high + 1e-9
+
+
+@pytest.mark.parametrize(("torque_Nm", "power_W"), [(500.0, 25_000.0), (0.2, 10.0), (-3.0, 0.0), (np.nan, None)])
+def test_the_torque_that_is_measured_heats_and_its_noise_below_zero_does_not(parameters, torque_Nm, power_W):
+    """Without a measurement the friction does that pads of their mean surface temperature have."""
+    s, m = new_state()[0], np.zeros(1, SAMPLE)[0]
+    s["temperature_known"], s["fused"] = True, 5000.0
+    m["dt"], m["brake_torque"], m["wheel_speed"], m["has_wheel_speed"] = 0.004, torque_Nm, 50.0, True
+    s["pads"][0], s["pads"][1], thermal = 100.0, 500.0, parameters[0]["thermal"]
+    heat(s, parameters[0], m)
+    power_W = friction_power(thermal, 5000.0, 50.0, 300.0) if power_W is None else power_W
+    assert s["power"] == pytest.approx(power_W)
+
+
+def test_a_speed_that_nothing_tells_heats_nothing_and_may_have_heated(parameters):
+    """As at 110 km/h, by the friction of pads of their mean surface temperature."""
+    s, m, thermal = new_state()[0], np.zeros(1, SAMPLE)[0], parameters[0]["thermal"]
+    s["temperature_known"], s["fused"], s["pads"][0], s["pads"][1] = True, 5000.0, 100.0, 500.0
+    m["dt"], m["brake_torque"] = 0.004, np.nan
+    heat(s, parameters[0], m)
+    may_have = friction_power(thermal, 5000.0, 100.0, 300.0) * 0.004 / thermal["disc_heat_capacity"]
+    assert s["power"] == 0.0 and s["temperature_sigma"] == pytest.approx(may_have)
+
+
+def test_a_plate_that_repeats_is_stuck_once_heat_has_had_the_time_to_come_through_the_pad(parameters):
+    """That is L²/(4 a), of a mean that has moved by 20 K."""
+    s, m, thermal = new_state()[0], np.zeros(1, SAMPLE)[0], parameters[0]["thermal"]
+    thermal["conductivity"] = 3.0
+    takes_s = thermal["thickness"] ** 2 / (4.0 * _diffusivity(thermal))
+    s["plate"], s["plate_mean"], s["mean"] = 20.0, 20.0, 40.0
+    m["inner_backplate"], m["outer_backplate"], m["has_thermocouple"] = 20.0, 20.0, True
+    for share, stuck in ((0.95, False), (0.1, True)):
+        _watch_plates(s, thermal, m, share * takes_s)
+        assert s["plate_stuck"] == stuck
+
+
+def test_pads_take_no_more_than_all_the_heat(thermal):
+    """However much of it effects send there."""
+    pads, work, all_of_it = np.full((2, NODES), 20.0), np.empty((4, CHAIN)), UNALTERED._replace(heat_share=99.0)
+    disc = heat_step(thermal, pads, 20.0, 20.0, 20.0, 20.0, 9000.0, False, 0.0, 0.004, work, LONGEST_S, all_of_it)
+    assert min(pads.min(), disc) > 20.0 - 1e-9 and pads[0, 0] > 25.0
 
 
 def test_pads_forget_their_temperature_over_the_time_of_the_calibration(parameters):

@@ -855,7 +855,8 @@ def test_pads_that_creep_otherwise_are_known_after_some_stops(p, share, seconds,
 def test_a_change_that_is_likelier_than_none_shifts_the_force_by_itself(opened):
     a = opened[0]["alternatives"]
     a["shift"] = 10.0, 20.0, 30.0, 40.0, 50.0
-    for odds, shift in (((-1.0, -0.1, -2.0, -np.inf, 9.0), 0.0), ((-1.0, 2.0, 1.0, 3.0, 9.0), 40.0)):
+    unlikely, likely, slightly = (-1.0, -0.1, -2.0, -np.inf, 9.0), (-1.0, 2.0, 1.0, 3.0, 9.0), (-1.0, 0.5, 0.1, -2.0, 9.0)
+    for odds, shift in ((unlikely, 0.0), (likely, 40.0), (slightly, 20.0)):
         a["log_odds"] = odds
         assert likely_shift(opened[0]) == shift
 
@@ -905,14 +906,14 @@ def test_a_contact_angle_that_moved_is_expected_to_move_again(p, opened):
         s["contact_angle"] += moved
         s["contact"]["engaged"], s["braked"] = True, False
         settle(s, p, False, 0.0)
-        s["contact_age_s"] = 10.0
+        s["contact_age_s"] += 10.0
 
     for _ in range(10):
         touch(0.0)
     assert s["contact_walk"] == 0.0
     for stop in range(10):
         touch(1.0 if stop % 2 else -1.0)
-    assert s["contact_walk"] == pytest.approx(1.0 / 10.0, rel=0.1)
+    assert s["contact_walk"] == pytest.approx(1.0 / 10.0, rel=0.01)
     for _ in range(10):
         touch(0.0)
     assert s["contact_walk"] < 0.001

@@ -19,6 +19,7 @@ from emb_daemon.models.lateness import (
     follow,
     interrupt,
     remember,
+    speed_then,
     stand,
     turned_within,
     unfilter,
@@ -200,6 +201,14 @@ def test_a_gain_that_the_integration_of_the_speed_may_make_is_none():
 
 def test_no_angle_is_older_than_the_oldest():
     assert _age(late_s=0.016) == 0.015
+
+
+def test_a_speed_is_as_old_as_asked_or_the_oldest_that_is_kept():
+    w = np.zeros(1, LATELY)[0]
+    for speed in range(40):
+        remember(w, float(speed), _DT)
+    oldest = 40 - len(w["speed"])
+    assert [speed_then(w, age * _DT) for age in (0, 2, 39 - oldest, 99)] == [39, 37, oldest, oldest]
 
 
 @pytest.mark.parametrize("size", [1.0, 0.25])

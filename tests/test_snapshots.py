@@ -202,7 +202,7 @@ def test_a_calibration_that_is_replaced_before_the_first_sample_takes_no_snapsho
     ("name", "value"),
     [("clearance", 90.0), ("clearance_sigma", -1.0), ("scale", 10.0), ("creep", [0.0, 0.6]), ("growth", 1.0), ("disc", 5000.0),
      ("winding", 9.0), ("history", 1e9), ("temperature_sigma", None),
-     ("history_sigma", -1.0), ("error", [9e9] * 16), ("covariance", [[1.0] * 15 + [2.0]] * 16)],
+     ("history_sigma", -1.0), ("error", [9e9] * 16), ("covariance", [[1e-4] * 15 + [2e-4]] * 16)],
 )  # fmt: skip
 def test_what_no_brake_can_have_known_is_not_used(driven, tmp_path, caplog, name, value):
     """The checksum is right, the values are not."""

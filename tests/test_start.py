@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import restart
-from emb_daemon.estimator.records import new_state
+from emb_daemon.estimator.records import ESTIMATE, new_state
+from emb_daemon.estimator.step import step
+from emb_daemon.models.fusion import FAST, NOISE
 from emb_daemon.models.stiffness import travel_at
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
@@ -262,3 +264,32 @@ def test_after_a_restart_the_time_since_the_snapshot_tells_what_pads_may_remembe
         restart.resume(restarted[0], p, snapshot, elapsed_s)
         sigmas[elapsed_s] = estimate(rested, p, restarted)["sigma"][1]
     assert sigmas[10.0] > 1.3 * estimate(rested, p)["sigma"][1] and sigmas[900.0] < 1.1 * p["stiffness_sigma"]
+
+
+@pytest.mark.parametrize(("elapsed_s", "disc", "pads"), [(0.1, 200.0, 197.3), (300.0, 141.0, 69.4)])
+def test_after_a_restart_pads_and_disc_have_cooled_for_as_long_as_they_rested(p, elapsed_s, disc, pads):
+    """Out of 200 degC, under plates of 20; softening goes on by its own time constant to what the pads were."""
+    s, snapshot, out, first = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0], np.zeros(1, ESTIMATE)[0], _standing(p)[0][0]
+    step(s, p, first, out)
+    s["disc"], s["pads"], s["history"], p["thermal"]["history_time"] = 200.0, 200.0, 50.0, 100.0
+    s["contact_angle"] += 0.1
+    assert restart.take_snapshot(s, p, snapshot) and snapshot["clearance"] == pytest.approx(p["clearance"] + 0.1)
+    resumed = new_state()[0]
+    restart.resume(resumed, p, snapshot, elapsed_s)
+    assert resumed["error"][FAST] == resumed["error"][NOISE] == 0.0, "of the moment alone"
+    assert (resumed["temperature_sigma"] - s["temperature_sigma"] > 10.0) == (elapsed_s > 100.0)
+    step(resumed, p, first, out)
+    assert resumed["disc"] == pytest.approx(disc, abs=0.5) and resumed["mean"] == pytest.approx([pads, pads], abs=0.5)
+    rise = 200.0 - p["thermal"]["reference"]
+    assert resumed["history"] == pytest.approx(rise + (50.0 - rise) * np.exp(-elapsed_s / 100.0), abs=0.1)
+
+
+def test_an_error_of_ten_sigma_is_no_brakes(p):
+    s, snapshot, widest = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0], new_state()[0]
+    estimate(_standing(p)[0], p, s.reshape(1))
+    assert restart.take_snapshot(s, p, snapshot)
+    restart._widen(widest, p)
+    sigma = np.sqrt(np.diag(widest["covariance"]) + np.diag(snapshot["covariance"]))
+    for sigmas, told in ((9.9, ""), (-10.1, "error")):
+        snapshot["error"] = sigmas * sigma
+        assert restart.why_implausible(snapshot, p) == told

@@ -106,6 +106,17 @@ def test_a_sample_later_than_a_cycle_is_no_contradiction(clamp):
     )
 
 
+def test_pads_begin_as_warm_as_their_plates_and_until_those_are_heard_as_in_the_calibration(p):
+    state, out, plates = new_state()[0], np.zeros(1, ESTIMATE)[0], row()
+    plates["has_thermocouple"] = False
+    step(state, p, plates, out)
+    assert not state["temperature_known"] and out["stiffness_factor"] == 1.0
+    plates["has_thermocouple"], plates["inner_backplate"], plates["outer_backplate"] = True, 90.0, 30.0
+    step(state, p, plates, out)
+    assert state["disc"] == 60.0 and state["history"] == pytest.approx(60.0 - p["thermal"]["reference"])
+    assert state["mean"] == pytest.approx([75.0, 45.0], abs=3.0)
+
+
 @pytest.mark.parametrize("late", [0, 2])
 def test_an_angle_that_comes_late_is_known_to_be(p, late):
     """By the speed beside it, within two strokes."""

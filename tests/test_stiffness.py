@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, travel_at
+from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
 from emb_daemon.offline import estimate
 
 _force = st.floats(-3e4, 3e4)
@@ -65,6 +65,12 @@ def test_no_force_in_the_clearance(plain):
     rows, _ = brake.samples(plain, np.linspace(0.0, 0.99 * plain["clearance"], 200))
     estimates = estimate(rows, plain)
     assert np.all(estimates["stiffness_force"] == 0.0)
+
+
+@pytest.mark.parametrize(("x", "slope"), [(3.0, 800.0), (0.0, 112.5), (-0.25, 0.0)])
+def test_the_slope_about_an_uncertain_contact_is_that_of_the_force_over_it(x, slope):
+    """200 N/rad and 200 N/rad² over a quarter of a radian to each side; before contact there is none."""
+    assert mean_slope(x, 0.25, np.array([200.0, 100.0, 0.0])) == pytest.approx(slope, rel=1e-12)
 
 
 def test_estimates_never_see_the_future(parameters):

@@ -16,7 +16,7 @@ from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import MODES, REASONS, REQUESTS, RESULTS, reason_words
 from emb_daemon.wire.e2e import crc, protect
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
-from emb_daemon.wire.layout import CORNERS, default_layout, load_layout, pack, unpack
+from emb_daemon.wire.layout import CORNERS, _concerning, default_layout, load_layout, pack, unpack
 from emb_daemon.wire.receive import (
     ACCEPTED,
     BAD_COUNTER,
@@ -262,6 +262,8 @@ def test_corners_that_are_not_ours_are_foreign():
     assert _receive(_resolver(0, 0), new_reception(), layout)[1] == IGNORED
     assert _receive(frame("EMB_FL_ClampForce"), new_reception(), layout)[1] == IGNORED
     assert _receive(frame("EMB_FR_Resolver"), new_reception(), layout)[1] == ACCEPTED
+    # As out of that of all corners, which a compiled library holds.
+    assert _concerning(("FR",), default_layout().copy()).tobytes() == layout.tobytes()
 
 
 def test_a_repeated_frame_is_refused_and_the_next_taken(heard):

@@ -53,11 +53,8 @@ def read(path: Path) -> bytes:
 
 
 def decode(data: bytes, kind: type[_Kept], version: int) -> _Kept:
-    """What `encode` was given, of type ``kind``, whose ``format`` must be ``version``.
-
-    Raises:
-        ValueError: not such a file, or damaged; says which.
-    """
+    """What `encode` was given, of type ``kind``, whose ``format`` must be ``version``. Raises ValueError: not such a file, or
+    damaged; says which."""
     try:
         file = msgspec.json.decode(data, type=_Sealed)
         if hashlib.sha256(bytes(file.content)).hexdigest() != file.sha256:

@@ -31,11 +31,8 @@ def to_fields(record: np.void) -> dict[str, object]:
 
 
 def from_fields(fields: dict[str, object], dtype: np.dtype) -> np.void:
-    """The record of ``dtype`` that `to_fields` was given.
-
-    Raises:
-        ValueError: other fields, or another shape or type of one; names it.
-    """
+    """The record of ``dtype`` that `to_fields` was given. Raises ValueError: other fields, or another shape or type of one;
+    names it."""
     if not isinstance(fields, dict) or fields.keys() != set(dtype.names):
         raise ValueError(f"state: expected the fields {', '.join(dtype.names)}")
     record = np.zeros(1, dtype)[0]

@@ -112,11 +112,8 @@ def _merge(entries: list[Entry], sources: str, triple: str):
 
 
 def emit_object(entries: list[Entry], sources: str, target: Target) -> bytes:
-    """The entry points, and the `mark` of ``sources``, as a relocatable ELF object.
-
-    Raises:
-        RuntimeError: an entry point needs an address of this process.
-    """
+    """The entry points, and the `mark` of ``sources``, as a relocatable ELF object. Raises RuntimeError: an entry point needs
+    an address of this process."""
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     machine = llvm.Target.from_triple(target.triple).create_target_machine(cpu=target.cpu, opt=3, reloc="pic")

@@ -15,11 +15,7 @@ from emb_daemon.calibration.types import Calibration
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Read a calibration.
-
-    Raises:
-        InputErrors: every fault with file, line and key.
-    """
+    """Read a calibration. Raises InputErrors: every fault with file, line and key."""
     return load_yaml(Path(path), Calibration)
 
 

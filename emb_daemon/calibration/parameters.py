@@ -99,11 +99,7 @@ class Parameter:
 
 
 def parameter(calibration: Calibration, key: str) -> Parameter:
-    """What is known of a key.
-
-    Raises:
-        InputError: no number has that key; names near ones.
-    """
+    """What is known of a key. Raises InputError: no number has that key; names near ones."""
     value = value_of(calibration, key)
     parts = _parts(key)
     if parts[0] == "effects":
@@ -118,11 +114,7 @@ def parameter(calibration: Calibration, key: str) -> Parameter:
 
 
 def value_of(calibration: Calibration, key: str) -> float:
-    """The number at a key, in the key's unit.
-
-    Raises:
-        InputError: no number has that key; names near ones.
-    """
+    """The number at a key, in the key's unit. Raises InputError: no number has that key; names near ones."""
     if (found := _number_at(calibration, key)) is None:
         raise _unknown(calibration, key)
     return found

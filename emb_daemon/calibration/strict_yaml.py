@@ -204,11 +204,8 @@ def _compose(name: str, text: str) -> yaml.Node:
 
 
 def load_yaml(path: Path, kind: type[_T]) -> _T:
-    """Read a YAML file into a struct type.
-
-    Raises:
-        InputErrors: every fault found, each as ``file:line: key: what was expected``.
-    """
+    """Read a YAML file into a struct type. Raises InputErrors: every fault found, each as ``file:line: key: what was
+    expected``."""
     try:
         text = read_input(path, _MOST_BYTES).decode()
     except UnicodeDecodeError as error:

@@ -57,11 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _ask(corners: list[str]) -> None:
-    """Ask before deleting: the values may have taken years to learn.
-
-    Raises:
-        InputError: nobody is there to answer, or the answer is no.
-    """
+    """Ask before deleting: the values may have taken years to learn. Raises InputError: nobody is there to answer, or the
+    answer is no."""
     if not corners:
         return
     if not sys.stdin.isatty():

@@ -1,14 +1,13 @@
 """emb-daemon fleet."""
 
 import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from emb_daemon.cli.options import CALIBRATION_HELP, add_mapping_argument, add_path, check_output
 from emb_daemon.cli.progress import progress
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 from emb_daemon.resources import resource
 
 EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
@@ -106,7 +105,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 def _print_faults(texts: list[str]) -> None:
     for text in texts:
-        print(f"  {text}", file=sys.stderr)
+        tell(f"  {text}")
 
 
 def _fault(_item: Any, reason: str) -> str:

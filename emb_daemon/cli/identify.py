@@ -1,12 +1,11 @@
 """emb-daemon identify."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from emb_daemon.cli.options import add_mapping_argument, add_path, check_output, open_mapping
 from emb_daemon.cli.progress import progress
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 
 #: Exit status if the calibration is written although a log for it is missing or could not be used. Logs with thermocouples in
 #: the pads may be missing, because many users have no such rig.
@@ -39,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     with progress() as show:
         result = identify(campaign, show)
     for fault in campaign.faults:
-        print(fault, file=sys.stderr)
+        tell(fault)
     save_calibration(result.calibration, arguments.output)
     if arguments.report:
         arguments.report.mkdir(parents=True, exist_ok=True)

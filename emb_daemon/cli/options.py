@@ -3,12 +3,11 @@
 import argparse
 import json
 import os
-import sys
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 
 if TYPE_CHECKING:
     from emb_daemon.calibration.configuration import Bus
@@ -32,11 +31,7 @@ def add_share_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, ...] = ()) -> None:
-    """Refuse a path that cannot be written, that is not a regular file, or that is an input.
-
-    Raises:
-        InputError: with the path and what was expected.
-    """
+    """Refuse a path that cannot be written, that is not a regular file, or that is an input."""
     from emb_daemon.logs.write import ending_of
 
     if not path.absolute().parent.is_dir():
@@ -68,16 +63,12 @@ def open_mapping(path: Path) -> "Mapping":
 
     mapping = Mapping(path)
     for note in mapping.notes:
-        print(note, file=sys.stderr)
+        tell(note)
     return mapping
 
 
 def log_reader(mapping: Path | None) -> Callable:
-    """Function that reads a log's FRAME array from its path.
-
-    Raises:
-        InputErrors: the mapping file is faulty.
-    """
+    """Function that reads a log's FRAME array from its path."""
     from emb_daemon.logs.read import read_frames
 
     return open_mapping(mapping).read if mapping else read_frames

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from emb_daemon.cli.options import CALIBRATION_HELP, LOG_HELP, add_mapping_argument, add_path, check_output, log_reader
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 from emb_daemon.estimator.status import TABLE
 from emb_daemon.resources import resource
 
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     results = [result for log in arguments.logs for result in replay.run_corners(log)]
     for note in replay.notes:
-        print(note, file=sys.stderr)
+        tell(note)
     if arguments.calibration:
         _warn_of_other_motor(results, calibration.motor)
     for result in results if arguments.measured_torque else ():
@@ -89,16 +89,12 @@ def _calibration(arguments: argparse.Namespace):
         calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
     if not calibration.contact.is_in_reach:
         clearance = calibration.contact.clearance_rad
-        print(
+        tell(
             f"{arguments.calibration}: contact.clearance_rad is {clearance:g} rad, so there is nothing to clamp; estimates "
-            "are clamp forces, never negative; `diagnose` takes a load of either sign",
-            file=sys.stderr,
+            "are clamp forces, never negative; `diagnose` takes a load of either sign"
         )
     if arguments.mapping and not arguments.calibration:
-        print(
-            f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's",
-            file=sys.stderr,
-        )
+        tell(f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's")
     return calibration
 
 
@@ -112,7 +108,7 @@ def _warn_of_other_motor(results, motor):
         for line in other_motor(samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2) or other_current(
             samples, result.force_N, motor
         ):
-            print(f"{result.path}: {CORNERS[result.samples['corner'][0]]}: {line}", file=sys.stderr)
+            tell(f"{result.path}: {CORNERS[result.samples['corner'][0]]}: {line}")
 
 
 def _secure(arguments: argparse.Namespace, read):

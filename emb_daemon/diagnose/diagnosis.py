@@ -76,16 +76,14 @@ class Diagnosis:
         selection: what the search chose.
         findings: one for each effect of the catalogue, accepted ones first.
         recalibrated: base parameters, by key.
-        initial, residual: by channel, on the fit logs, before anything and after everything.
         before, after: errors of the running estimator on what ``judged_on`` says.
         validated: RMS by which each finding lowers its channel's residual on the validation logs.
         judged_residual: (before, after) RMS of each channel's residual on the validation logs.
-        left: what is left, by channel; ``left_before``: dependences before anything was accepted.
+        left: what is left, by channel.
         withdrawn: names of what the fit logs prove and confirmation took out again.
         outside: where the validation logs leave the range in which a term was found.
     """
 
-    original: Calibration
     calibration: Calibration
     bench: Bench
     judges: Bench
@@ -93,15 +91,11 @@ class Diagnosis:
     selection: Selection
     findings: tuple[Candidate, ...]
     recalibrated: Mapping[str, Recalibrated]
-    signals: Mapping[str, np.ndarray]
-    initial: Mapping[str, np.ndarray]
-    residual: Mapping[str, np.ndarray]
     before: EpisodeErrors
     after: EpisodeErrors
     validated: Mapping[str, float]
     judged_residual: Mapping[str, tuple[float, float]]
     left: Mapping[str, Left]
-    left_before: Mapping[str, list[Dependence]]
     withdrawn: tuple[str, ...]
     outside: Sequence[Outside]
     seconds: float
@@ -136,8 +130,8 @@ class Diagnosis:
     @property
     def stiffness_scale(self) -> float:
         """Force of the mounted pads' curve over that of the calibration, where that is half of the largest."""
-        before, after = (curve_at(c.stiffness.curves, c.pad_thickness_mm) for c in (self.original, self.calibration))
-        travel = travel_at(0.5 * self.original.stiffness.maximum_force_N, before)
+        before, after = (curve_at(c.stiffness.curves, c.pad_thickness_mm) for c in (self.bench.calibration, self.calibration))
+        travel = travel_at(0.5 * self.bench.calibration.stiffness.maximum_force_N, before)
         return float(characteristic_curve(travel, after)[0] / characteristic_curve(travel, before)[0])
 
     def figures(self) -> dict[str, dict[str, dict[str, Any]]]:
@@ -199,7 +193,6 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
     logs = [trial.log for trial in bench.trials]
     made = [term for term in augmented.terms if term.name in selection.accepted]
     result = Diagnosis(
-        original=calibration,
         calibration=_with_provenance(augmented, selection, after, judged_on, logs),
         bench=bench,
         judges=judging,
@@ -207,15 +200,11 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         selection=selection,
         findings=findings(selection),
         recalibrated=_list_recalibrated(selection),
-        signals=selection.screening.signals,
-        initial=selection.screening.initial,
-        residual=selection.model.residual,
         before=before,
         after=after,
         validated=validation_gains(selection, judges) if judges else {},
         judged_residual={c: (rms_known(judged_before[c]), rms_known(final[c])) for c in judging.channels} if judges else {},
         left=_left(selection, chosen, judged_before, final, judging, augmented),
-        left_before=selection.at_first,
         withdrawn=tuple(name for name in chosen.accepted if name not in selection.accepted),
         outside=outside_range(judges.under(augmented), made) if judges else (),
         seconds=time.monotonic() - begin,

@@ -34,7 +34,7 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> 
         return np.zeros(0, np.int64)
     longest = float(np.clip((time_s[-1] - time_s[0]) / _PIECES, _SHORTEST_S, _LONGEST_S))
     moving = np.flatnonzero(~_holding(time_s, angle_rad))
-    cuts = [0]
+    cuts = []
     for start, stop in pairwise([*_applications(time_s, force_N), len(time_s)]):
         duration = time_s[stop - 1] - time_s[start]
         pieces = max(1, round(duration / longest))
@@ -45,7 +45,7 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> 
             cuts += np.unique(inside[np.minimum(np.searchsorted(inside, wanted), len(inside) - 1)]).tolist()
         cuts.append(stop)
     apart = [0]
-    for cut in cuts[1:-1]:
+    for cut in cuts[:-1]:
         if time_s[cut] - time_s[apart[-1]] >= _SHORTEST_S:
             apart.append(cut)
     return np.searchsorted(apart, np.arange(len(time_s)), side="right") - 1

@@ -23,7 +23,7 @@ def page(diagnosis: Diagnosis) -> str:
     judges = ", ".join(trial.log.path.name for trial in diagnosis.judges.trials)
     report = Page(
         "Diagnosis of a clamp force estimate",
-        f"{diagnosis.original.actuator} · found in {logs} · judged on "
+        f"{diagnosis.bench.calibration.actuator} · found in {logs} · judged on "
         + (judges if diagnosis.judged_on == "validate" else "left-out episodes")
         + f" · emb-daemon {__version__}",
     )
@@ -104,18 +104,18 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
     section = report.section(
         title(finding).capitalize(), f"{finding.effect.equation}, with {size(finding)}. {finding.reason}."
     )
-    channel = finding.channel
-    signal = finding.over if finding.made else diagnosis.signals.get(finding.effect.signal)
+    channel, signals = finding.channel, diagnosis.selection.screening.signals
+    signal = finding.over if finding.made else signals.get(finding.effect.signal)
     if channel not in FORCE_CHANNELS or signal is None:
         return
-    applied = (diagnosis.signals["clamp_force"] > CLAMPED_N) & np.isfinite(signal)
+    applied = (signals["clamp_force"] > CLAMPED_N) & np.isfinite(signal)
     if channel != "stiffness" or not applied.any():
         applied = np.isfinite(signal)
     unit = UNITS[channel]
     traces = []
     for residual, name, style in (
-        (diagnosis.initial[channel], "before", PALE),
-        (diagnosis.residual[channel], "after", MODEL),
+        (diagnosis.selection.screening.initial[channel], "before", PALE),
+        (diagnosis.selection.model.residual[channel], "after", MODEL),
     ):
         traces.append(Trace(name, *_bin(signal[applied], residual[applied]), style))
     traces.append(Trace("what it does", *_bin(signal[applied], finding.contribution[applied]), MARKS))
@@ -142,21 +142,22 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
         ],
         "Residual with the contact angle held. No effect of the catalogue explains what is marked; none was invented.",
     )
+    screening, residual = diagnosis.selection.screening, diagnosis.selection.model.residual
     for channel, left in diagnosis.left.items():
         if not left.dependences:
             continue
         # Temperatures have times of their own, and signals that only the estimator has no column here.
-        strongest, keep = left.dependences[0].signal, diagnosis.residual[channel] != 0.0
-        signal = diagnosis.signals.get(strongest)
+        strongest, keep = left.dependences[0].signal, residual[channel] != 0.0
+        signal = screening.signals.get(strongest)
         if channel in FORCE_CHANNELS and signal is not None and keep.sum() >= _FEWEST:
-            before = _bin(signal[keep], diagnosis.initial[channel][keep])
-            after = _bin(signal[keep], diagnosis.residual[channel][keep])
+            before = _bin(signal[keep], screening.initial[channel][keep])
+            after = _bin(signal[keep], residual[channel][keep])
             traces = [Trace("before", *before, PALE), Trace("after", *after, MARKS)]
             section.figure(
                 xy_figure([Panel(f"{NAMES[channel]}, mean residual", "N", traces)], strongest.replace("_", " ")),
                 f"Strongest dependence of the {NAMES[channel]} residual after the diagnosis.",
             )
-        earlier = {d.signal: f"{d.share:.3f}" for d in diagnosis.left_before.get(channel, [])}
+        earlier = {d.signal: f"{d.share:.3f}" for d in diagnosis.selection.at_first.get(channel, [])}
         section.table(
             ["signal", "share before", "share after", "mean gain / its error"],
             [

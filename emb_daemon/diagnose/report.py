@@ -16,6 +16,7 @@ _LISTED = 6
 
 def report(diagnosis: Diagnosis) -> dict[str, Any]:
     """Everything, for scripts."""
+    before, after = diagnosis.bench.calibration.noise, diagnosis.calibration.noise
     return {
         "paths": {
             path: {
@@ -32,9 +33,9 @@ def report(diagnosis: Diagnosis) -> dict[str, Any]:
         "recalibrated": {key: _recalibrated(found) for key, found in diagnosis.recalibrated.items()},
         "stiffness_scale": diagnosis.stiffness_scale,
         "noise": {
-            name: {"before": getattr(diagnosis.original.noise, name), "after": getattr(diagnosis.calibration.noise, name)}
+            name: {"before": getattr(before, name), "after": getattr(after, name)}
             for name in ("stiffness_N", "stiffness_relative", "stiffness_correlation_s")
-            if getattr(diagnosis.original.noise, name) != getattr(diagnosis.calibration.noise, name)
+            if getattr(before, name) != getattr(after, name)
         },
         "not_recalibrated": {
             channel: _gain(gain, channel) | {"reason": reason} for channel, (gain, reason) in diagnosis.refused.items()

@@ -198,7 +198,7 @@ def _withdrawn(diagnosis: Diagnosis, channel: str) -> list[str]:
 
 
 def _stated(diagnosis: Diagnosis) -> list[str]:
-    before, now = (c.noise.torque_lasting for c in (diagnosis.original, diagnosis.calibration))
+    before, now = (c.noise.torque_lasting for c in (diagnosis.bench.calibration, diagnosis.calibration))
     if now <= before:
         return []
     return [f"Some stops leave the torque off by another {100.0 * now:.2g} %, which the calibration states from now on."]

@@ -92,11 +92,7 @@ _Result = TypeVar("_Result")
 
 
 def _first_done(client: "Client", futures: Iterable) -> set:
-    """Those of some futures that are done, as soon as one is.
-
-    Raises:
-        Unavailable: the scheduler or all workers are gone.
-    """
+    """Those of some futures that are done, as soon as one is. Raises Unavailable: the scheduler or all workers are gone."""
     from distributed import CancelledError, wait
 
     absent = 0

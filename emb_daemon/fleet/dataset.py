@@ -92,11 +92,7 @@ def partition(unit: str, corner: str) -> Path:
 
 
 def folder_of(path: Path, *parts: str | Path) -> Path:
-    """A folder of the data set, created if it does not exist.
-
-    Raises:
-        InputError: it cannot be created.
-    """
+    """A folder of the data set, created if it does not exist. Raises InputError: it cannot be created."""
     folder = Path(path, *parts)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,11 +120,7 @@ def write_drive(root: Path, drive: Drive, about: About, samples: np.ndarray, for
 
 
 def read_drive(root: Path, drive: Drive) -> tuple[Log, About]:
-    """A drive as it was ingested.
-
-    Raises:
-        InputError: no such drive, or not a file of a data set.
-    """
+    """A drive as it was ingested. Raises InputError: no such drive, or not a file of a data set."""
     import pyarrow
     import pyarrow.parquet
 
@@ -154,11 +146,7 @@ def read_drive(root: Path, drive: Drive) -> tuple[Log, About]:
 
 
 def drives(root: Path) -> list[Drive]:
-    """Everything ingested, by unit, corner and time.
-
-    Raises:
-        InputError: nothing was ingested.
-    """
+    """Everything ingested, by unit, corner and time. Raises InputError: nothing was ingested."""
     if not (found := named(root)):
         raise InputError(f"{root}: holds no drives, expected a data set of emb-daemon fleet ingest")
     return sorted(found)

@@ -14,10 +14,9 @@ from emb_daemon.errors import InputError
 from emb_daemon.fleet.dataset import day_of
 from emb_daemon.fleet.population import (
     LEAST_UNITS,
+    Difference,
     Directions,
-    Outlier,
     Readings,
-    Shared,
     centres,
     changing,
     outliers,
@@ -146,11 +145,8 @@ def load(root: Path) -> Findings:
 
 
 def read_units(path: Path) -> dict[str, dict[str, str]]:
-    """Factors by unit: a CSV file with a column ``unit``, and one for each factor (batch, supplier, plant, ...).
-
-    Raises:
-        InputError: not such a file, or a unit occurs twice.
-    """
+    """Factors by unit: a CSV file with a column ``unit``, and one for each factor (batch, supplier, plant, ...). Raises
+    InputError: not such a file, or a unit occurs twice."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
@@ -289,7 +285,7 @@ class _Study:
             trends=self._trends([*groups][:3], over["day"], readings),
         )
 
-    def _finding(self, where: str, units: int, one: Shared | Outlier, action: Callable[[Cause], str]) -> Finding:
+    def _finding(self, where: str, units: int, one: Difference, action: Callable[[Cause], str]) -> Finding:
         own, size = self.causes[one.cause], float(self.directions.size_N[one.cause])
         return Finding(
             where=where, units=units, cause=own.name, key=own.key, shape=own.shape, amount=one.amount, sigma=one.sigma,
@@ -297,12 +293,12 @@ class _Study:
             rivals=tuple(dict.fromkeys(self.causes[r].name for r in one.rivals if self.causes[r].name != own.name)),
         )  # fmt: skip
 
-    def _list_shared(self, shared: Sequence[Shared], action: Callable[[Cause], str]) -> list[Finding]:
-        found = [self._finding(one.group, int(self.masks[one.group].sum()), one, action) for one in shared]
+    def _list_shared(self, shared: Sequence[Difference], action: Callable[[Cause], str]) -> list[Finding]:
+        found = [self._finding(one.where, int(self.masks[one.where].sum()), one, action) for one in shared]
         return [one for one in found if abs(one.size_N) >= _LEAST_SHARED_N]
 
     def _outliers(self, deviations: np.ndarray, readings: Readings, action: Callable[[Cause], str]) -> list[Finding]:
-        found = [self._finding(" ".join(self.keys[one.row]), 1, one, action) for one in outliers(deviations, readings)]
+        found = [self._finding(" ".join(self.keys[one.where]), 1, one, action) for one in outliers(deviations, readings)]
         return [one for one in found if abs(one.size_N) >= _LEAST_UNIT_N]
 
     def _place_units(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
@@ -337,10 +333,10 @@ class _Study:
             )  # fmt: skip
         return result
 
-    def _trends(self, shared: Sequence[Shared], drifts: Sequence[Finding], readings: Readings) -> list[Trend]:
+    def _trends(self, shared: Sequence[Difference], drifts: Sequence[Finding], readings: Readings) -> list[Trend]:
         """Trends of the causes that batches share and of drifts, by windows of time, over all drives of a group together."""
         names = [str(cause) for cause in self.causes]
-        wanted = [(s.group, s.cause) for s in shared]
+        wanted = [(s.where, s.cause) for s in shared]
         wanted += [
             (f.where, next(row for row, c in enumerate(self.causes) if (c.key, c.shape) == (f.key, f.shape))) for f in drifts
         ]

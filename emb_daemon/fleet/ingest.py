@@ -66,11 +66,8 @@ def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping
 
 
 def log_files(paths: Iterable[Path]) -> list[Path]:
-    """The given files, and all logs in the given folders, in order.
-
-    Raises:
-        InputError: no such file, or a folder without logs.
-    """
+    """The given files, and all logs in the given folders, in order. Raises InputError: no such file, or a folder without
+    logs."""
     found: list[Path] = []
     for path in paths:
         inside = sorted(file for file in path.rglob("*") if log_ending(file) in LOG_ENDINGS) if path.is_dir() else [path]
@@ -123,11 +120,8 @@ def ingest(root: Path, job: Job) -> dict[str, Any]:
 def ingest_frames(
     root: Path, frames: np.ndarray, unit: str, digest: str, source: str, notes: str = "", day: str = ""
 ) -> list[Drive]:
-    """A FRAME array as drives of the data set, one for each corner in it.
-
-    Raises:
-        InputError: no resolver sample of any corner.
-    """
+    """A FRAME array as drives of the data set, one for each corner in it. Raises InputError: no resolver sample of any
+    corner."""
     corners = corners_in(frames, Path(source))
     begin_ns = int(frames["time_ns"][0])
     samples, pipeline = samples_in(frames, corners)

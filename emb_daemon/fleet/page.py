@@ -21,11 +21,7 @@ _COLUMNS = ["where", "units", "cause", "force / N", "amount", "chance", "not tol
 
 
 def fleet_page(root: Path) -> Page:
-    """The report of a data set.
-
-    Raises:
-        InputError: it has not been diagnosed.
-    """
+    """The report of a data set. Raises InputError: it has not been diagnosed."""
     found = load(root)
     page = Page(
         f"Fleet of {len(found.units)} units",

@@ -219,23 +219,22 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Shared:
-    """A cause that a group of units shares.
+class Difference:
+    """A cause that a group of units shares, or in which one unit differs from its group.
 
     Attributes:
-        group, cause: indices; ``cause`` is a row of the prints.
-        amount, sigma: of the cause.
-        p_value: of the hypothesis that there is no difference, over units.
-        chance: the same, corrected for all tested groups and causes (Holm, Scandinavian J. of Statistics 6, 1979): a batch is
-            recalled because of a single finding, so that no finding may be false.
+        where, cause: name of the group or row of the unit, and row of the prints.
+        amount, sigma: of the cause; of a unit ``sigma`` is the scatter between units.
+        chance: of a group, that of no difference, corrected for all tested groups and causes (Holm, Scandinavian J. of
+            Statistics 6, 1979): a batch is recalled because of a single finding, so that none may be false. Of a unit the
+            q-value over all (Benjamini and Hochberg): it is only inspected in a workshop, so a known share may be false.
         rivals: causes that would explain nearly as much.
     """
 
-    group: str
+    where: str | int
     cause: int
     amount: float
     sigma: float
-    p_value: float
     chance: float
     rivals: tuple[int, ...]
 
@@ -255,7 +254,7 @@ def shared_causes(
     readings: Readings,
     beside: bool,
     misfits: Collection[int] = (),
-) -> list[Shared]:
+) -> list[Difference]:
     """Causes that groups of units share, one after the other, the strongest first, until none is significant.
 
     Args:
@@ -265,7 +264,7 @@ def shared_causes(
     """
     rows, prints = readings.ordinary, readings.prints
     chosen: list[tuple[str, int]] = []
-    found: list[Shared | None] = []
+    found: list[Difference | None] = []
     first: dict[str, float] = {}
     amounts = np.zeros(0)
     while len(chosen) < len(groups) * len(prints):
@@ -295,7 +294,7 @@ def shared_causes(
         rivals = tuple(int(c) for c in np.flatnonzero(gains[group] >= _RIVAL * gains[group].max()) if c != cause)
         chosen.append((group, cause))
         mismatch = gain < _SECOND * first.setdefault(group, gain)
-        found.append(None if mismatch or cause in misfits else Shared(group, cause, value, sigma, p_value, chance, rivals))
+        found.append(None if mismatch or cause in misfits else Difference(group, cause, value, sigma, chance, rivals))
         amounts = _together(units[rows], [(groups[g][rows], prints[c]) for g, c in chosen], readings, beside)
     return [replace(one, amount=float(amount)) for one, amount in zip(found, amounts, strict=True) if one]
 
@@ -324,20 +323,7 @@ def _together(
     return np.linalg.lstsq(normal, right, rcond=1e-10)[0]
 
 
-@dataclass(frozen=True)
-class Outlier:
-    """A unit that differs from its group, with fields as in `Shared`. ``sigma`` is the scatter between units, ``chance`` the
-    q-value over all (Benjamini and Hochberg): a unit is only inspected in a workshop, so a known share may be false."""
-
-    row: int
-    cause: int
-    amount: float
-    sigma: float
-    chance: float
-    rivals: tuple[int, ...]
-
-
-def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
+def outliers(deviations: np.ndarray, readings: Readings) -> list[Difference]:
     """Units that differ from their group, shape (N, q) about its centre, largest difference first. The difference must exceed
     both the scatter between units and that between the unit's own drives, each as well as it is known: ten drives tell a
     scatter to a quarter, and of many units one has it from drives that happen to agree."""
@@ -359,7 +345,7 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Outlier]:
         rivals = tuple(int(c) for c in np.flatnonzero(gains >= _RIVAL * gains.max()) if c != cause)
         amount = float(amounts[row, cause])
         sigma = float(max(spread[cause], noise[row, cause]))
-        found.append(Outlier(int(row), cause, amount, sigma, float(q_values[row]), rivals))
+        found.append(Difference(int(row), cause, amount, sigma, float(q_values[row]), rivals))
     return sorted(found, key=lambda one: (one.chance, -abs(one.amount / one.sigma)))
 
 

@@ -25,11 +25,7 @@ def is_replayed(root: Path, drive: Drive, makers: str) -> bool:
 
 def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict[str, Any]:
     """Write a drive's estimates (columns of the command-line contract, with the clamp force where a log has one) and figures;
-    returns these.
-
-    Raises:
-        InputError: the drive's file is missing or damaged.
-    """
+    returns these. Raises InputError: the drive's file is missing or damaged."""
     log, about = read_drive(root, drive)
     estimates = estimate(log.samples, to_parameters(calibration))
     result = Result(log.path, log.time_ns, estimates, log.samples, log.reference, log.force_N)

@@ -142,11 +142,7 @@ class Scorer:
         )
 
     def score(self, log: Log, drive: Drive) -> Score:
-        """Scores of one drive.
-
-        Raises:
-            InputError: the drive cannot be used; says why.
-        """
+        """Scores of one drive. Raises InputError: the drive cannot be used; says why."""
         # All units must be treated alike, with or without a force sensor.
         unknown = replace(log, force_N=np.full(len(log.samples), np.nan))
         bench = _Bench(unknown, self.calibration, self._contact, self._made)

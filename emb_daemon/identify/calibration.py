@@ -61,11 +61,8 @@ def nominal(sheet: Datasheet, name: str, pad_thickness_mm: float, measured_mm: S
 
 
 def tidy(calibration: Calibration) -> Calibration:
-    """Seven digits: far more than is known, and a file that people can read.
-
-    Raises:
-        InputErrors: what was found is not what a calibration file may hold.
-    """
+    """Seven digits: far more than is known, and a file that people can read. Raises InputErrors: what was found is not what a
+    calibration file may hold."""
     values = {key: value_of(calibration, key) for key in keys(calibration)}
     # A value that needs no rounding stays the same object: fields that are still the default are left out of the file.
     return moved(calibration, {key: rounded(v, 7) for key, v in values.items() if rounded(v, 7) != v}, checked=True)

@@ -18,11 +18,8 @@ FILES = Path(__file__).with_name("example_files")
 
 
 def write_example(folder: Path) -> list[Path]:
-    """Write DBC, mapping, datasheet, campaign and logs of a simulated rig; returns their paths.
-
-    Raises:
-        InputError: the folder is there and not empty, or cannot be made.
-    """
+    """Write DBC, mapping, datasheet, campaign and logs of a simulated rig; returns their paths. Raises InputError: the folder
+    is there and not empty, or cannot be made."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: expected an empty folder, or none yet")
     folder.mkdir(parents=True, exist_ok=True)

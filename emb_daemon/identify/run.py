@@ -74,8 +74,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     found = attribution.identify(stiff, heat.hot, known, lambda text, share: progress(0.7 + 0.2 * share, text))
     progress(0.9, "validating")
     folds = [fold.under(found.without(fold)) for fold in folds]
-    known_errors = found.hot, found.hot_current, found.undecided, found.fastest_rad_per_s
-    levels = noise.identify(campaign, stiff, motor, folds, interpolation, *known_errors)
+    levels = noise.identify(campaign, stiff, motor, folds, interpolation, found)
     calibration = tidy(moved(found.calibration, levels.values))
     heat = thermal.validate(campaign, heat, calibration)
     validations = []

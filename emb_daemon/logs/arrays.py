@@ -2,13 +2,12 @@
 
 import io
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 from emb_daemon.logs.read import needs_extra
 
 ENDINGS = (".mat", ".npz", ".npy", ".h5", ".hdf5", ".tdms", ".json", ".jsonl", ".ndjson")
@@ -101,7 +100,7 @@ def _of_json(path: Path, content: bytes) -> Iterator[tuple[str, object]]:
         except ValueError:
             if number < len(lines):
                 raise
-            print(f"{path}: its last line is cut off, left out", file=sys.stderr)
+            tell(f"{path}: its last line is cut off, left out")
     yield "", rows
 
 

@@ -157,10 +157,7 @@ def _start_ns(content: bytes) -> int:
 
 def read_blf(path: Path, content: bytes, most_bytes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """FRAME array, payloads, one after the other, those of CAN FD whole, channels by number, and whether the log is cut off.
-
-    Raises:
-        InputError: damaged, or larger than ``most_bytes`` once it is unpacked.
-    """
+    Raises InputError: damaged, or larger than ``most_bytes`` once it is unpacked."""
     if len(content) < _HEADER or not content.startswith(b"LOGG"):
         raise InputError(f"{path}: not a BLF file")
     header = int.from_bytes(content[_SIZE_AT : _SIZE_AT + 4], "little")

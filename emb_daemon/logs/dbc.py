@@ -1,10 +1,10 @@
 """DBCs of other people: what cantools refuses in them, and other tools do not, is left out, and said."""
 
 import re
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from emb_daemon.errors import tell
 from emb_daemon.wire.layout import NO_DBC, load_database, not_readable, read_dbc
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def load_foreign(path: Path) -> "Database":
             left_out.append(what)
             continue
         for what in left_out:
-            print(f"{path}: {what}: left out", file=sys.stderr)
+            tell(f"{path}: {what}: left out")
         return database
 
 

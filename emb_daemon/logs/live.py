@@ -17,7 +17,7 @@ from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
 from emb_daemon.logs.columns import absent_raw
 from emb_daemon.logs.mapping import Mapping, Source, alone
-from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, our_messages, unrepeated
+from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, fill_missing, our_messages, unrepeated
 from emb_daemon.runtime.bus import PythonCan, PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
@@ -227,7 +227,7 @@ class MappedBus(PythonCanBus):
     def _sample(self, corner: str, resolver: _Message, time_ns: int) -> list[tuple | None]:
         """A sample of a corner, and the slow messages that are due."""
         rows = [
-            slow.frame(_complete(slow), time_ns)
+            slow.frame(fill_missing(name, slow.last()), time_ns)
             for name, slow in self._messages.items()
             if not name.endswith(("_Resolver", "_Current", "_ForceSensor")) and self._is_due(slow, time_ns)
         ]
@@ -263,16 +263,6 @@ def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
         known["MotorSpeed"] = (known["MotorAngle"] - before["MotorAngle"]) / elapsed_s if before else 0.0
     resolver.before = known
     return known | {"MotorSpeed": float(unrepeated(known["MotorSpeed"], resolver.counter))}
-
-
-def _complete(slow: _Message) -> dict[str, float]:
-    """A slow message's values, with substitutes for missing ones (`resample.SUBSTITUTES`)."""
-    known = slow.last()
-    plates = [known[name] for name in ("InnerBackplateTemp", "OuterBackplateTemp") if name in known]
-    if plates:
-        mean = 0.5 * (plates[0] + plates[-1])
-        known = {"InnerBackplateTemp": plates[0], "OuterBackplateTemp": plates[-1], "CaliperTemp": mean} | known
-    return known
 
 
 class ReferenceBus(PythonCanBus):

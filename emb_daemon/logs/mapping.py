@@ -6,7 +6,6 @@ A foreign log has neither our ids nor E2E protection nor our sampling rate; `log
 
 import math
 import re
-import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from pathlib import Path
@@ -17,7 +16,7 @@ from msgspec import Meta, field
 
 from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
-from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.errors import InputError, InputErrors, tell
 from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions, has_dead_current, starts_anew
 from emb_daemon.logs.dbc import load_foreign
@@ -294,11 +293,7 @@ class Mapping:
         return f"; did you mean {' or '.join(like)}?" if like else ""
 
     def _their_unit(self, bus: str | None, signal: str) -> str:
-        """Of a signal as the rig describes it, empty if it does not.
-
-        Raises:
-            KeyError: the rig's DBC has no such signal.
-        """
+        """Of a signal as the rig describes it, empty if it does not. Raises KeyError: the rig's DBC has no such signal."""
         if not self.databases:
             return ""
         return self._message(bus, signal).get_signal_by_name(signal.rpartition(".")[2]).unit or ""
@@ -385,11 +380,8 @@ class Mapping:
         return {key: source for key, source in self.messages.get(message, {}).items() if isinstance(source, Source)}
 
     def read(self, path: str | Path) -> np.ndarray:
-        """A foreign log as FRAME array of our messages, in time order; instead of `logs.read.read_frames`.
-
-        Raises:
-            InputError: unreadable, or nothing of the mapped signals in it.
-        """
+        """A foreign log as FRAME array of our messages, in time order; instead of `logs.read.read_frames`. Raises InputError:
+        unreadable, or nothing of the mapped signals in it."""
         return self.read_with_digest(path)[0]
 
     def read_with_digest(self, path: str | Path) -> tuple[np.ndarray, str]:
@@ -406,7 +398,7 @@ class Mapping:
         for (_, name), (stamps, values) in raw.items():
             if len(values) and np.any(none := no_values(values)):
                 these = ", ".join(f"{value:g}" for value in np.unique(values[none]))
-                print(f"{path}: {name}: {np.sum(none)} values are {these}, which stand for none: left out", file=sys.stderr)
+                tell(f"{path}: {name}: {np.sum(none)} values are {these}, which stand for none: left out")
                 raw[_, name] = stamps[~none], values[~none]
         messages = {
             name: {
@@ -418,21 +410,17 @@ class Mapping:
         for name, signals in messages.items():
             angle = signals.get("MotorAngle")
             if isinstance(angle, Series) and not angle.is_sparse and np.any(stray := strays(angle.values)):
-                print(
-                    f"{path}: {name}: {np.sum(stray)} values of MotorAngle are far from both beside them: left out",
-                    file=sys.stderr,
-                )
+                tell(f"{path}: {name}: {np.sum(stray)} values of MotorAngle are far from both beside them: left out")
                 signals["MotorAngle"] = Series(angle.time_ns[~stray], angle.values[~stray])
         for corner in CORNERS:
             if has_dead_current(corner, messages):
                 del messages[f"EMB_{corner}_Current"]
-                print(
+                tell(
                     f"{path}: {corner}: CurrentQ is 0 throughout, while the motor turns: it is taken as not measured, and the "
-                    "force rests on the motor angle alone",
-                    file=sys.stderr,
+                    "force rests on the motor angle alone"
                 )
             for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
-                print(f"{path}: {corner}: {line}", file=sys.stderr)
+                tell(f"{path}: {corner}: {line}")
         self._check_rate(path, messages)
         for name in messages:
             if name.endswith("_Resolver") and not self._sources(name):
@@ -451,7 +439,7 @@ class Mapping:
             for key, source in self._sources(name).items():
                 stated = "" if stated_in(source.name) else units.get(source.name, "")
                 if question := source.questioned(stated):
-                    print(f"{path}: {name}.{key}: {question}", file=sys.stderr)
+                    tell(f"{path}: {name}.{key}: {question}")
 
     def _check_rate(self, path: Path, messages: dict) -> None:
         for corner in CORNERS:
@@ -509,12 +497,8 @@ class Mapping:
         return found
 
     def _rows(self, path: Path, recorded: Recorded, message, channel: str | None) -> np.ndarray:
-        """Of a message's frames.
-
-        Raises:
-            InputError: the log has nothing of the channel, or the message comes from two channels or senders and the mapping
-                names none.
-        """
+        """Of a message's frames. Raises InputError: the log has nothing of the channel, or the message comes from two channels
+        or senders and the mapping names none."""
         frames = recorded.frames
         flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
         of_kind = flags == EXTENDED * message.is_extended_frame

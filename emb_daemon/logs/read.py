@@ -7,7 +7,6 @@ import hashlib
 import io
 import lzma
 import os
-import sys
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.bounded import read_input
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 from emb_daemon.logs.apart import mdf_columns
 from emb_daemon.logs.blf import read_blf
 from emb_daemon.logs.candump import parse_candump
@@ -70,11 +69,8 @@ def read_file(path: Path) -> bytes:
 
 
 def unpack(path: Path, raw: bytes) -> bytes:
-    """A file's bytes, unpacked if it was packed, whatever it is called; a truncated one up to its end.
-
-    Raises:
-        InputError: damaged, or too large once it is unpacked.
-    """
+    """A file's bytes, unpacked if it was packed, whatever it is called; a truncated one up to its end. Raises InputError:
+    damaged, or too large once it is unpacked."""
     packer, opened = next((how for beginning, how in _PACKED.items() if raw.startswith(beginning)), ("", None))
     if opened is None:
         return raw
@@ -96,7 +92,7 @@ def unpack(path: Path, raw: bytes) -> bytes:
         raise InputError(f"{path}: damaged {packer} file ({error})") from None
     except EOFError:
         content = b"".join(parts)
-        print(f"{path}: cut off, read up to there ({len(content)} bytes)", file=sys.stderr)
+        tell(f"{path}: cut off, read up to there ({len(content)} bytes)")
         return content
     return b"".join(parts)
 
@@ -131,7 +127,7 @@ def _candump(path: Path, text: bytes) -> _Parsed:
     octets = np.zeros(len(text) // 2, np.uint8)
     frames, bad_line, unfinished = parse_candump(text, octets)
     if bad_line and unfinished and bad_line > 1:
-        print(f"{path}: line {bad_line} is cut off, left out", file=sys.stderr)
+        tell(f"{path}: line {bad_line} is cut off, left out")
     elif bad_line:
         raise InputError(f"{path}:{bad_line}: not a candump line, expected '(seconds.fraction) interface id#data'")
 
@@ -146,7 +142,7 @@ def _candump(path: Path, text: bytes) -> _Parsed:
 def _blf(path: Path, content: bytes) -> _Parsed:
     frames, octets, channels, cut = read_blf(path, content, _most_bytes())
     if cut:
-        print(f"{path}: cut off, read up to there ({len(frames)} frames)", file=sys.stderr)
+        tell(f"{path}: cut off, read up to there ({len(frames)} frames)")
     return frames, octets, lambda: channels.astype(str)
 
 
@@ -236,16 +232,12 @@ def read_with_digest(path: str | Path) -> tuple[np.ndarray, str]:
     recorded = read_log(path)
     frames = at_our_rate(recorded.frames)
     if frames is not recorded.frames:
-        print(f"{path}: sampled at another rate than every {CYCLE_NS // 1_000_000} ms, brought to it", file=sys.stderr)
+        tell(f"{path}: sampled at another rate than every {CYCLE_NS // 1_000_000} ms, brought to it")
     return frames, recorded.digest
 
 
 def read_log(path: str | Path) -> Recorded:
-    """A log as it stands.
-
-    Raises:
-        InputError: as `read_frames`.
-    """
+    """A log as it stands. Raises InputError: as `read_frames`."""
     path = Path(path)
     raw = read_file(path)
     content = unpack(path, raw)

@@ -4,7 +4,6 @@ Another rig's measurements are converted to our messages, E2E protected, with co
 pipeline is the only way into the estimator.
 """
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from emb_daemon.errors import tell
 from emb_daemon.jit import njit
 from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right, nearest, shipped_database
 from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
@@ -266,7 +266,7 @@ def fill_missing(name: str, signals: Signals) -> Signals:
     if name.endswith("_Resolver"):
         angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
         if isinstance(angle, Series) and isinstance(speed, Series) and (why := _another_motion(angle, speed)):
-            print(f"{name}: MotorSpeed {why}: left out, the change of the angle is taken", file=sys.stderr)
+            tell(f"{name}: MotorSpeed {why}: left out, the change of the angle is taken")
             speed = None
         angle = speed.integral() if angle is None else angle
         return {"MotorAngle": angle, "MotorSpeed": angle.derivative() if speed is None else speed}
@@ -486,16 +486,14 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
                 so = "count as not measured" if is_reference else "make no frames"
                 much = np.max(np.abs(column[np.isfinite(column)])) / layout["high"]
                 smaller = f" If so, a `scale` {much:.2g} times smaller would fit, with all that it is compared with"
-                print(
+                tell(
                     f"{message.name}: {name} is beyond {layout['low']:g} to {layout['high']:g} in {100.0 * beyond:.3g} % of "
-                    f"the samples, which {so}; is its unit right?{smaller if much > 1.0 else ''}",
-                    file=sys.stderr,
+                    f"the samples, which {so}; is its unit right?{smaller if much > 1.0 else ''}"
                 )
             if length == 1 and (between := np.mean((column > _FLAG) & (column < 1.0 - _FLAG))) > _MOST_BEYOND:
-                print(
+                tell(
                     f"{message.name}: {name} is 0 or 1, and between them in {100.0 * between:.3g} % of the samples; less than "
-                    "a half is sent as 0: `scale` it so that all that is meant by 1 is at least that",
-                    file=sys.stderr,
+                    "a half is sent as 0: `scale` it so that all that is meant by 1 is at least that"
                 )
             raw = np.rint((np.where(known, column, layout["offset"]) - layout["offset"]) / layout["factor"]).astype(np.int64)
             if is_reference:
@@ -526,10 +524,9 @@ def _within(message: str, angle: np.ndarray, low: float, high: float) -> np.ndar
     if not np.any((angle < low) | (angle > high)):
         return angle
     period = 2.0 * np.pi * np.floor((high - low) / (2.0 * np.pi))
-    print(
+    tell(
         f"{message}: MotorAngle covers {np.nanmax(angle) - np.nanmin(angle):.4g} rad, more than our message carries and than "
-        f"anything that clamps: it starts anew every {period:.5g} rad; is its unit right?",
-        file=sys.stderr,
+        f"anything that clamps: it starts anew every {period:.5g} rad; is its unit right?"
     )
     return low + np.mod(angle - low, period)
 

@@ -1,11 +1,10 @@
 """Faults of recorders' time stamps: coarse, in bunches, repeated, going back; and values that are only held."""
 
-import sys
 from collections.abc import Sequence
 
 import numpy as np
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 
 #: Largest time that int64 nanoseconds can express, s: the year 2262.
 LATEST_S = 9.2e9
@@ -62,10 +61,9 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
             raise InputError(
                 f"{source}: time goes back by {by:.6g} s after value {back[0] + 1}; expected one recording in a file"
             )
-        print(
+        tell(
             f"{source}: time goes back by {by:.6g} s after value {back[0] + 1}: {len(time_ns) - len(rows)} of {len(time_ns)} "
-            "values of another time left out",
-            file=sys.stderr,
+            "values of another time left out"
         )
     rows = rows[np.argsort(time_ns[rows], kind="stable")]
     times = time_ns[rows]
@@ -89,11 +87,11 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
         between = float(np.mean(steps[going_on & ~near]))
         times = _spread(times, np.flatnonzero(~going_on) + 1, round(_BUNCHES * between / mean))
         kept = np.concatenate([[True], np.diff(times) > 0])
-        print(f"{source}: stamps come in bunches, one every {1e-6 * between:.3g} ms: spread evenly", file=sys.stderr)
+        tell(f"{source}: stamps come in bunches, one every {1e-6 * between:.3g} ms: spread evenly")
     else:
         kept = np.concatenate([[True], ~(near & same) & (steps > 0)])
         if not kept.all():
-            print(f"{source}: {np.sum(~kept)} of {len(kept)} values were recorded twice: left out", file=sys.stderr)
+            tell(f"{source}: {np.sum(~kept)} of {len(kept)} values were recorded twice: left out")
     return times[kept], rows[kept]
 
 

@@ -6,7 +6,6 @@ import hashlib
 import io
 import itertools
 import re
-import sys
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from emb_daemon.errors import InputError
+from emb_daemon.errors import InputError, tell
 from emb_daemon.logs import arrays
 from emb_daemon.logs.read import ending_of_content, log_ending, needs_extra, read_file, unpack
 from emb_daemon.logs.stamps import LATEST_S, in_time
@@ -152,7 +151,7 @@ def _seconds(path: str, table, time) -> np.ndarray:
         return times
     stated = stated_in(time.signal) or (table.schema.field(time.signal).metadata or {}).get(_UNIT, b"").decode()
     if stated and time.rate_Hz is None and UNITS[stated] != UNITS[time.unit]:
-        print(f"{path}: {time.signal} says {stated} and is taken in {time.unit}: which is right?", file=sys.stderr)
+        tell(f"{path}: {time.signal} says {stated} and is taken in {time.unit}: which is right?")
     return times * UNITS[time.unit][1] if time.rate_Hz is None else times / time.rate_Hz
 
 
@@ -220,7 +219,7 @@ def _of_workbook(path: Path, content: bytes, names: list[str]) -> bytes:
     alike = [name for name, count in zip(book.sheet_names, with_names, strict=True) if count == most > 0]
     if len(alike) > 1:
         listed = ", ".join(alike[:_LISTED]) + (", …" if len(alike) > _LISTED else "")
-        print(f"{path}: {len(alike)} sheets have these columns ({listed}); the first alone is read", file=sys.stderr)
+        tell(f"{path}: {len(alike)} sheets have these columns ({listed}); the first alone is read")
     rows = sheets[with_names.index(most)] if sheets else []
     text = io.StringIO()
     csv.writer(text).writerows(rows)
@@ -309,7 +308,7 @@ def _numbers(path: str, table, name: str) -> np.ndarray:
     few = len({cells[row] for row in odd}) <= _FEW_WORDS
     if len(odd) > (0.5 if few else _MOST_ODD) * len(cells):
         raise InputError(f"{path}: {name}: expected a column of numbers; {len(odd)} cells are none, {first}")
-    print(f"{path}: {name}: {len(odd)} cells are no numbers, left out, {first}", file=sys.stderr)
+    tell(f"{path}: {name}: {len(odd)} cells are no numbers, left out, {first}")
     return values
 
 
@@ -403,10 +402,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     elif len(first) > len(cells):
         cells = _with_nameless(path, cells, rows[units:], lines[header + 1 + units])
     if _are_pairs(cells, rows[units:]):
-        print(
-            f"{path}: a name stands over two columns, a time and its value: the value is taken; `column 1` is a time",
-            file=sys.stderr,
-        )
+        tell(f"{path}: a name stands over two columns, a time and its value: the value is taken; `column 1` is a time")
         cells = ["", *cells[:-1]]
     odd = []
 
@@ -428,7 +424,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     reached = odd[0].actual_columns if len(odd) > table.num_rows else len(cells)
     if reached < len(cells) and {*names} <= {*cells[:reached]} | {f"column {n + 1}" for n in range(reached)}:
         more = ", ".join(filter(None, cells[reached:]))
-        print(f"{path}: rows have {reached} cells, the header {len(cells)}; its last name nothing: {more}", file=sys.stderr)
+        tell(f"{path}: rows have {reached} cells, the header {len(cells)}; its last name nothing: {more}")
         cells = cells[:reached]
         table = read(".")
     wanted = [table.column(place) for name in names if (place := _place(name, table.column_names)) is not None]
@@ -443,7 +439,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
             f"first of them {odd[0].actual_columns}; expected a table with the columns {_some('', cells)}"
         )
     if odd:
-        print(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out", file=sys.stderr)
+        tell(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out")
     stated = [next(filter(None, map(known_as, column)), "") for column in itertools.zip_longest(*rows[:units], fillvalue="")]
     marks = {_DECIMAL: b","} if commas else {}
     fields = [
@@ -461,7 +457,7 @@ def _under_one_header(path: Path, content: bytes, header: int) -> bytes:
     if len(parts) < 2 or not line.strip() or _is_number(line.decode(errors="replace").strip()):
         return content
     told = f"the header is repeated {len(parts) - 1} times; that and the words above it are left out"
-    print(f"{path}: {told}", file=sys.stderr)
+    tell(f"{path}: {told}")
     above = [_WORDS.sub(b"", part) if header else part for part in parts[:-1]]
     return b"\n".join([over, line, *above, parts[-1]])[1:]
 
@@ -495,7 +491,7 @@ def _with_nameless(path: Path, names: list[str], rows: list[list[str]], line: st
     if more == 1 and (numbered or line.lstrip().startswith('"')):
         return ["", *names]
     last = ", ".join(f"column {len(names) + n + 1}" for n in range(more))
-    print(f"{path}: rows have {len(rows[0])} cells, the header names {len(names)}; the last are {last}", file=sys.stderr)
+    tell(f"{path}: rows have {len(rows[0])} cells, the header names {len(names)}; the last are {last}")
     return [*names, *[""] * more]
 
 
@@ -579,11 +575,8 @@ def _is_number(cell: str) -> bool:
 
 
 def _group_and_index(path: Path, file, name: str) -> tuple[int, int]:
-    """Group and index of a channel in a measurement; several of the same name are distinguished by their group.
-
-    Raises:
-        InputError: there is none, or several.
-    """
+    """Group and index of a channel in a measurement; several of the same name are distinguished by their group. Raises
+    InputError: there is none, or several."""
     plain, _, group = name.rpartition(_IN_GROUP)
     places = [place for place in file.channels_db.get(plain, ()) if group.isdigit() and place[0] == int(group)]
     if not (places := places or list(file.channels_db.get(name, ()))):

@@ -16,6 +16,7 @@ from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.columns import DEPTHS_MM, References, latest
 from emb_daemon.logs.read import needs_extra
 from emb_daemon.wire.contract import MODES, SOURCES, reason_words
+from emb_daemon.wire.frames import message_of
 from emb_daemon.wire.layout import CORNERS
 
 TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
@@ -136,15 +137,7 @@ def write_frames(path: Path, frames: np.ndarray) -> None:
         try:
             with can.Logger(part) as logger:
                 for frame in frames:
-                    data = int(frame["data"]).to_bytes(8, "little")[: frame["length"]]
-                    logger(
-                        can.Message(
-                            timestamp=1e-9 * int(frame["time_ns"]),
-                            arbitration_id=int(frame["can_id"]),
-                            data=data,
-                            is_extended_id=False,
-                        )
-                    )
+                    logger(message_of(frame))
         except ImportError as error:
             raise needs_extra(path, error) from None
         os.replace(part, path)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from emb_daemon.monitor.listener import Corner, Listener
+from emb_daemon.monitor.listener import Listener
 from emb_daemon.wire.contract import MODES, REASONS, SOURCES, STATUSES
 
 _TEMPERATURES = ("inner_surface", "inner_mean", "outer_surface", "outer_mean")
@@ -43,27 +43,17 @@ def _family(name: str, kind: str, about: str, rows: Iterable[tuple[str, float | 
 
 def exposition(listener: Listener, now_ns: int) -> str:
     """Every corner from which broadcasts were received, at a time on the monotonic clock."""
-    states = {corner.name: (corner, corner.state(now_ns)) for corner in listener.heard}
+    states = [(f'corner="{corner.name}"', corner.state(now_ns)) for corner in listener.heard]
     lines: list[str] = []
     for name, (about, value) in _GAUGES.items():
-        lines += _family(name, "gauge", about, ((f'corner="{key}"', value(state)) for key, (_, state) in states.items()))
-    rows = (
-        (f'corner="{key}",place="{place}"', state[f"{place}_C"])
-        for key, (_, state) in states.items()
-        for place in _TEMPERATURES
-    )
+        lines += _family(name, "gauge", about, ((corner, value(state)) for corner, state in states))
+    rows = ((f'{corner},place="{place}"', state[f"{place}_C"]) for corner, state in states for place in _TEMPERATURES)
     lines += _family("emb_pad_temperature_celsius", "gauge", "Pad temperature", rows)
     for name, (about, field, words) in _WORDS.items():
-        rows = ((f'corner="{key}",{field}="{word}"', float(state[field] == word)) for key, (_, state) in states.items()
-                for word in words)  # fmt: skip
+        rows = ((f'{corner},{field}="{word}"', float(state[field] == word)) for corner, state in states for word in words)
         lines += _family(name, "gauge", about, rows)
-    lines += _family("emb_reason", "gauge", "Whether the estimate is degraded for this reason", _reasons(states.values()))
+    rows = ((f'{corner},reason="{word}"', float(word in state["reasons"])) for corner, state in states for word in REASONS)
+    lines += _family("emb_reason", "gauge", "Whether the estimate is degraded for this reason", rows)
     for name, (about, field) in _COUNTERS.items():
-        lines += _family(name, "counter", about, ((f'corner="{key}"', state[field]) for key, (_, state) in states.items()))
+        lines += _family(name, "counter", about, ((corner, state[field]) for corner, state in states))
     return "\n".join([*lines, ""])
-
-
-def _reasons(states: Iterable[tuple[Corner, dict]]) -> Iterable[tuple[str, float]]:
-    for corner, state in states:
-        for word in REASONS:
-            yield f'corner="{corner.name}",reason="{word}"', float(word in state["reasons"])

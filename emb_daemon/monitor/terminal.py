@@ -74,11 +74,8 @@ def watch(bus: Bus, title: str) -> None:
 
 
 def listen(bus: Bus) -> tuple[Listener, int]:
-    """Listen until one complete second of the clock was received; returns listener and time.
-
-    Raises:
-        Unavailable: nothing is received for some seconds.
-    """
+    """Listen until one complete second of the clock was received; returns listener and time. Raises Unavailable: nothing is
+    received for some seconds."""
     listener, start = _listener(bus), time.monotonic_ns()
     heard_ns = 0
     while True:

@@ -69,19 +69,13 @@ def _slow_messages(corner: str) -> tuple[str, str, str]:
 
 def load_log(path: str | Path, corner: str = "FL", read: Callable[[Path], np.ndarray] = read_frames) -> Log:
     """Read a log into samples. ``read`` gives a FRAME array by path; `logs.mapping.Mapping.read` for logs of other rigs.
-
-    Raises:
-        InputError: unreadable, not a corner, or no resolver sample of it.
-    """
+    Raises InputError: unreadable, not a corner, or no resolver sample of it."""
     return log_of(read(Path(path)), corner, Path(path))
 
 
 def log_of(frames: np.ndarray, corner: str = "FL", path: Path = Path("frames")) -> Log:
-    """A FRAME array as samples; ``path`` is what messages call it.
-
-    Raises:
-        InputError: not a corner, or no resolver sample of it.
-    """
+    """A FRAME array as samples; ``path`` is what messages call it. Raises InputError: not a corner, or no resolver sample of
+    it."""
     return make_log(samples_in(frames, (CORNERS[corner_index(corner)],))[0], frames, corner, path)
 
 
@@ -128,11 +122,7 @@ def _why_empty(frames: np.ndarray, corner: str, resolver_id: int) -> str:
 
 
 def corner_index(corner: str) -> int:
-    """0 to 3.
-
-    Raises:
-        InputError: not a corner.
-    """
+    """0 to 3. Raises InputError: not a corner."""
     if corner not in CORNERS:
         raise InputError(f"corner {corner}: expected one of {', '.join(CORNERS)}")
     return CORNERS.index(corner)

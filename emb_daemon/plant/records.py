@@ -1,7 +1,5 @@
 """Records of the plant. SI units, temperatures in degC; parameters state their unit and meaning."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from emb_daemon.effects import REGISTRY
@@ -20,15 +18,6 @@ HISTORY = 64
 CURVE_TERMS = 5
 #: Points of the travel of a gear that is not constant, linear between them.
 TRAVEL_POINTS = 257
-
-
-class Field(NamedTuple):
-    """One number, or array of numbers, of a record."""
-
-    name: str
-    unit: str
-    meaning: str
-    shape: tuple[int, ...] = ()
 
 
 #: Places where drawn effects enter.
@@ -65,79 +54,77 @@ EFFECTS: dict[str, tuple[str, ...]] = {
 
 EFFECT_VALUES = np.dtype([(name, fields("f8", " ".join(names))) for name, names in EFFECTS.items()], align=True)
 
-#: Parameters of one corner's brake.
+#: Parameters of one corner's brake: name, unit, meaning and, of an array, its shape.
 PLANT_FIELDS = (
-    Field("torque_constant", "N m/A", "motor torque per torque-producing current at 25 degC"),
-    Field("inertia", "kg m2", "motor and gear, at the motor shaft"),
-    Field("gear_gain", "m/rad", "clamp travel per motor angle; torque per clamp force"),
-    Field("travel_angle", "rad", "motor angles past the released position of a gear that is not constant", (TRAVEL_POINTS,)),
-    Field("travel", "m", "clamp travel there, rising straight on beyond; all zero for a constant gear", (TRAVEL_POINTS,)),
-    Field("release_spring", "N/m", "force on the gear's output per travel from the released position"),
-    Field("maximum_speed", "rad/s", "motor speed at which the supply's voltage is used up"),
-    Field("maximum_current", "A", "inverter limit"),
-    Field("current_time", "s", "time constant of the current controller"),
-    Field("magnet_heating", "K/A2", "steady rise of the magnets over the caliper per squared current"),
-    Field("magnet_time", "s", "its time constant"),
-    Field("winding_time", "s", "time constant of the winding, which heats housing and magnets; 0: at once"),
-    Field("copper_per_K", "1/K", "rise of the winding's resistance with that of its temperature"),
-    Field("load_friction", "m/rad", "gear friction torque per clamp force (thesis mu_g)"),
-    Field("offset_friction", "N m", "gear friction torque without load (thesis eta_g)"),
-    Field("presliding_angle", "rad", "Dahl's transition angle"),
-    Field("presliding_damping", "N m s/rad", "damping of the friction spring, none while sliding"),
-    Field("curve", "N/rad^n", "characteristic curve, n = 1 to 5, cold", (CURVE_TERMS,)),
-    Field("relaxation_time", "s", "first relaxation of the clamp force"),
-    Field("contact_angle", "rad", "clearance: motor angle from the released position to contact, cold and unworn"),
-    Field("released_angle", "rad", "what the resolver reads in the released position: its zero is arbitrary"),
-    Field("curve_temperature", "degC", "pad temperature at which the curve holds"),
-    Field("softening", "1/K", "loss of stiffness per rise of the mean pad temperature"),
-    Field("softening_history", "1/K", "loss of stiffness per rise as remembered"),
-    Field("history_time", "s", "time constant of that memory"),
-    Field("pad_thickness", "m", "one pad's friction material"),
-    Field("pad_area", "m2", "one pad's friction surface"),
-    Field("density", "kg/m3", "of the friction material"),
-    Field("specific_heat", "J/(kg K)", "at 20 degC"),
-    Field("specific_heat_rise", "1/K", "relative"),
-    Field("conductivity", "W/(m K)", "at 20 degC"),
-    Field("conductivity_rise", "1/K", "relative"),
-    Field("heat_share", "1", "of the friction power into inner and outer pad directly", (2,)),
-    Field("contact_conductance", "W/(m2 K)", "pad surface to disc under full contact"),
-    Field("gap_conductance", "W/(m2 K)", "pad surface to disc when released"),
-    Field("touching_force", "N", "clamp force at which contact conducts half as well as it can"),
-    Field("plate_conductance", "W/(m2 K)", "pad to backing plate"),
-    Field("plate_heat_capacity", "J/(m2 K)", "backing plate per friction area"),
-    Field("plate_loss", "W/(m2 K)", "backing plate to caliper, inner and outer", (2,)),
-    Field("caliper_heat_capacity", "J/K", "caliper"),
-    Field("caliper_loss", "W/K", "caliper to surroundings"),
-    Field("disc_heat_capacity", "J/K", "disc"),
-    Field("disc_cooling", "W/K", "disc to surroundings at rest"),
-    Field("disc_cooling_per_speed", "J/(rad K)", "gain of that with wheel speed"),
-    Field("disc_radiating_area", "m2", "times emissivity"),
-    Field("effective_radius", "m", "where the pads act"),
-    Field("friction_coefficient", "1", "pad on disc at 20 degC, no speed, no force"),
-    Field("friction_per_K", "1/K", "its slope over pad surface temperature"),
-    Field("friction_per_speed", "s/rad", "its slope over wheel speed"),
-    Field("friction_per_force", "1/N", "its slope over clamp force"),
-    Field("current_noise", "A", "standard deviation of the cycle's mean current, coloured"),
-    Field("current_noise_time", "s", "correlation time of that noise"),
-    Field("speed_noise", "rad/s", "standard deviation of the measured motor speed, white"),
-    Field("angle_noise", "rad", "of the resolver before quantisation"),
-    Field("angle_count", "rad", "resolver's least count"),
-    Field("angle_hysteresis", "rad", "beyond half a count, that the angle moves before the converter's reading follows"),
-    Field("temperature_noise", "K", "thermocouples"),
-    Field("force_noise", "N", "reference force sensor of the rig"),
-    Field("force_lead", "s", "time by which the reference force is younger than the resolver's sample"),
-    Field("brake_torque_noise", "N m", "reference torque sensor of the rig"),
-    Field("sensor_limit", "N", "force at which the car's own force sensor ends; 0: it has none"),
-    Field("sensor_gain", "1", "relative error of what it says"),
-    Field("sensor_offset", "N", "its zero at the start, at the curve's temperature"),
-    Field("sensor_walk", "N/sqrt(s)", "random walk of that"),
-    Field("sensor_per_K", "N/K", "its drift with the caliper's temperature"),
-    Field("sensor_noise", "N", "white noise of one value"),
+    ("torque_constant", "N m/A", "motor torque per torque-producing current at 25 degC"),
+    ("inertia", "kg m2", "motor and gear, at the motor shaft"),
+    ("gear_gain", "m/rad", "clamp travel per motor angle; torque per clamp force"),
+    ("travel_angle", "rad", "motor angles past the released position of a gear that is not constant", (TRAVEL_POINTS,)),
+    ("travel", "m", "clamp travel there, rising straight on beyond; all zero for a constant gear", (TRAVEL_POINTS,)),
+    ("release_spring", "N/m", "force on the gear's output per travel from the released position"),
+    ("maximum_speed", "rad/s", "motor speed at which the supply's voltage is used up"),
+    ("maximum_current", "A", "inverter limit"),
+    ("current_time", "s", "time constant of the current controller"),
+    ("magnet_heating", "K/A2", "steady rise of the magnets over the caliper per squared current"),
+    ("magnet_time", "s", "its time constant"),
+    ("winding_time", "s", "time constant of the winding, which heats housing and magnets; 0: at once"),
+    ("copper_per_K", "1/K", "rise of the winding's resistance with that of its temperature"),
+    ("load_friction", "m/rad", "gear friction torque per clamp force (thesis mu_g)"),
+    ("offset_friction", "N m", "gear friction torque without load (thesis eta_g)"),
+    ("presliding_angle", "rad", "Dahl's transition angle"),
+    ("presliding_damping", "N m s/rad", "damping of the friction spring, none while sliding"),
+    ("curve", "N/rad^n", "characteristic curve, n = 1 to 5, cold", (CURVE_TERMS,)),
+    ("relaxation_time", "s", "first relaxation of the clamp force"),
+    ("contact_angle", "rad", "clearance: motor angle from the released position to contact, cold and unworn"),
+    ("released_angle", "rad", "what the resolver reads in the released position: its zero is arbitrary"),
+    ("curve_temperature", "degC", "pad temperature at which the curve holds"),
+    ("softening", "1/K", "loss of stiffness per rise of the mean pad temperature"),
+    ("softening_history", "1/K", "loss of stiffness per rise as remembered"),
+    ("history_time", "s", "time constant of that memory"),
+    ("pad_thickness", "m", "one pad's friction material"),
+    ("pad_area", "m2", "one pad's friction surface"),
+    ("density", "kg/m3", "of the friction material"),
+    ("specific_heat", "J/(kg K)", "at 20 degC"),
+    ("specific_heat_rise", "1/K", "relative"),
+    ("conductivity", "W/(m K)", "at 20 degC"),
+    ("conductivity_rise", "1/K", "relative"),
+    ("heat_share", "1", "of the friction power into inner and outer pad directly", (2,)),
+    ("contact_conductance", "W/(m2 K)", "pad surface to disc under full contact"),
+    ("gap_conductance", "W/(m2 K)", "pad surface to disc when released"),
+    ("touching_force", "N", "clamp force at which contact conducts half as well as it can"),
+    ("plate_conductance", "W/(m2 K)", "pad to backing plate"),
+    ("plate_heat_capacity", "J/(m2 K)", "backing plate per friction area"),
+    ("plate_loss", "W/(m2 K)", "backing plate to caliper, inner and outer", (2,)),
+    ("caliper_heat_capacity", "J/K", "caliper"),
+    ("caliper_loss", "W/K", "caliper to surroundings"),
+    ("disc_heat_capacity", "J/K", "disc"),
+    ("disc_cooling", "W/K", "disc to surroundings at rest"),
+    ("disc_cooling_per_speed", "J/(rad K)", "gain of that with wheel speed"),
+    ("disc_radiating_area", "m2", "times emissivity"),
+    ("effective_radius", "m", "where the pads act"),
+    ("friction_coefficient", "1", "pad on disc at 20 degC, no speed, no force"),
+    ("friction_per_K", "1/K", "its slope over pad surface temperature"),
+    ("friction_per_speed", "s/rad", "its slope over wheel speed"),
+    ("friction_per_force", "1/N", "its slope over clamp force"),
+    ("current_noise", "A", "standard deviation of the cycle's mean current, coloured"),
+    ("current_noise_time", "s", "correlation time of that noise"),
+    ("speed_noise", "rad/s", "standard deviation of the measured motor speed, white"),
+    ("angle_noise", "rad", "of the resolver before quantisation"),
+    ("angle_count", "rad", "resolver's least count"),
+    ("angle_hysteresis", "rad", "beyond half a count, that the angle moves before the converter's reading follows"),
+    ("temperature_noise", "K", "thermocouples"),
+    ("force_noise", "N", "reference force sensor of the rig"),
+    ("force_lead", "s", "time by which the reference force is younger than the resolver's sample"),
+    ("brake_torque_noise", "N m", "reference torque sensor of the rig"),
+    ("sensor_limit", "N", "force at which the car's own force sensor ends; 0: it has none"),
+    ("sensor_gain", "1", "relative error of what it says"),
+    ("sensor_offset", "N", "its zero at the start, at the curve's temperature"),
+    ("sensor_walk", "N/sqrt(s)", "random walk of that"),
+    ("sensor_per_K", "N/K", "its drift with the caliper's temperature"),
+    ("sensor_noise", "N", "white noise of one value"),
 )
 
-PLANT = np.dtype(
-    [(f.name, "f8", f.shape) if f.shape else (f.name, "f8") for f in PLANT_FIELDS] + [("effects", EFFECT_VALUES)], align=True
-)
+PLANT = np.dtype([(name, "f8", *shape) for name, _, _, *shape in PLANT_FIELDS] + [("effects", EFFECT_VALUES)], align=True)
 
 #: State of one corner. Angles are past the released position; temperatures degC; works and heats in J since the start.
 PLANT_STATE = np.dtype(

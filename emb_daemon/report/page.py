@@ -144,11 +144,7 @@ class Page:
         )
 
     def write(self, path: Path) -> None:
-        """Write the page completely or not at all.
-
-        Raises:
-            OSError: the folder cannot be written.
-        """
+        """Write the page completely or not at all. Raises OSError: the folder cannot be written."""
         write_atomically(Path(path), self.render().encode())
 
 

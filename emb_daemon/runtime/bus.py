@@ -12,7 +12,7 @@ import numpy as np
 
 from emb_daemon.errors import InputError, Unavailable
 from emb_daemon.runtime.rawcan import open_socketcan
-from emb_daemon.wire.frames import FRAME, row_of
+from emb_daemon.wire.frames import FRAME, message_of, row_of
 
 if TYPE_CHECKING:
     from can import Message
@@ -133,13 +133,10 @@ class PythonCanBus:
         return True
 
     def send(self, frames: np.ndarray) -> None:
-        import can
-
         for frame in frames:
-            data = int(frame["data"]).to_bytes(8, "little")
-            message = can.Message(arbitration_id=int(frame["can_id"]), data=data, is_extended_id=False)
+            message = message_of(frame)
             if self._hand_over(message) and self._echoes is not None:
-                self._echoes.append((message.arbitration_id, data))
+                self._echoes.append((message.arbitration_id, bytes(message.data)))
 
     def _hand_over(self, message: "Message") -> bool:
         """Whether the bus has accepted a message; counted if not."""

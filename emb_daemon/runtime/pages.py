@@ -41,11 +41,7 @@ class Page(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     files: dict[str, str]
 
     def apply(self, calibrations: Mapping[str, Calibration]) -> dict[str, Calibration]:
-        """The calibrations of the files with the page's numbers, checked like a file.
-
-        Raises:
-            InputError: every fault found.
-        """
+        """The calibrations of the files with the page's numbers, checked like a file. Raises InputError: every fault found."""
         faults: list[str] = []
         result = dict(calibrations)
         for name, values in self.values.items():

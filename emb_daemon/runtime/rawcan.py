@@ -233,11 +233,8 @@ class RawCanSocket:
 
 
 def open_socketcan(channel: str, ids: list[int], receive_buffer: int = 1 << 20) -> RawCanSocket:
-    """A SocketCAN interface with kernel time stamps, drop counter, error frames and filters for ``ids``.
-
-    Raises:
-        Unavailable: no such interface, or the kernel has no CAN.
-    """
+    """A SocketCAN interface with kernel time stamps, drop counter, error frames and filters for ``ids``. Raises Unavailable:
+    no such interface, or the kernel has no CAN."""
 
     def reopen() -> socket.socket:
         return _bound_socket(channel, ids, receive_buffer)

@@ -32,6 +32,15 @@ def payloads_to(can_id: int, frames: np.ndarray) -> list[bytes]:
     return [int(frame["data"]).to_bytes(8, "little")[: frame["length"]] for frame in mine]
 
 
+def message_of(frame: np.void) -> "Message":
+    """A FRAME row of an 11-bit id as a python-can Message."""
+    import can
+
+    data = int(frame["data"]).to_bytes(8, "little")[: frame["length"]]
+    time_s, can_id = 1e-9 * int(frame["time_ns"]), int(frame["can_id"])
+    return can.Message(timestamp=time_s, arbitration_id=can_id, data=data, is_extended_id=False)
+
+
 def row_of(message: "Message", time_ns: int) -> tuple[int, int, int, int, int]:
     """A python-can Message as a FRAME row; of CAN FD's payload the first eight bytes."""
     flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame

@@ -23,11 +23,8 @@ def key_file(name: str, relative_to: Path, environment: Mapping[str, str] = os.e
 
 
 def load_keys(path: Path, environment: Mapping[str, str] = os.environ) -> dict[str, bytes]:
-    """Keys of 16 bytes by name: a line each, ``#`` begins a comment.
-
-    Raises:
-        InputErrors: not readable, readable by others, or not a key file; every wrong line. Keys never appear in messages.
-    """
+    """Keys of 16 bytes by name: a line each, ``#`` begins a comment. Raises InputErrors: not readable, readable by others, or
+    not a key file; every wrong line. Keys never appear in messages."""
     try:
         text, status = read_input(path, _MOST_BYTES).decode(), path.stat()
     except UnicodeDecodeError:

@@ -109,11 +109,8 @@ def pack(value: float, signal: Record) -> Integer:
 
 
 def signal_columns(database: "Database", message: str, names: tuple[str, ...]) -> np.ndarray:
-    """SIGNAL records of the named signals of a cantools message.
-
-    Raises:
-        InputErrors: a message or signal is missing, or is not little-endian.
-    """
+    """SIGNAL records of the named signals of a cantools message. Raises InputErrors: a message or signal is missing, or is not
+    little-endian."""
     columns, faults = np.zeros(len(names), SIGNAL), []
     try:
         known = {signal.name: signal for signal in database.get_message_by_name(message).signals}
@@ -169,11 +166,7 @@ def not_readable(path: Path, error: Exception) -> InputError:
 
 
 def read_dbc(path: Path) -> str:
-    """The text of a DBC, in UTF-8 or as Vector's tools write it.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """The text of a DBC, in UTF-8 or as Vector's tools write it. Raises InputError: it cannot be read."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -224,11 +217,8 @@ def _frame_faults(message) -> list[str]:
 
 
 def _read_message(database: "Database", shipped: "Database", name: str, names: tuple[str, ...]) -> tuple[Any, np.ndarray]:
-    """A cantools message and SIGNAL records of its named signals, in the units of the shipped DBC.
-
-    Raises:
-        InputErrors: every fault of the message.
-    """
+    """A cantools message and SIGNAL records of its named signals, in the units of the shipped DBC. Raises InputErrors: every
+    fault of the message."""
     message = next((known for known in database.messages if known.name == name), None)
     faults, columns = _frame_faults(message) if message else [], np.zeros(0, SIGNAL)
     try:

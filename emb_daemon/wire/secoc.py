@@ -80,10 +80,7 @@ class Link(NamedTuple):
 
 def load_links(path: Path | None = None, corners: Iterable[str] = CORNERS) -> tuple[list[Link], list[Link]]:
     """(links that the daemon receives, links that it sends) of ``corners`` and the vehicle, by a DBC or the shipped one.
-
-    Raises:
-        InputErrors: the DBC lacks messages or has their fields elsewhere; every fault is listed.
-    """
+    Raises InputErrors: the DBC lacks messages or has their fields elsewhere; every fault is listed."""
     path = path or resource("dbc/emb.dbc")
     known = {message.name: message for message in load_database(path).messages}
     faults = []

@@ -70,11 +70,8 @@ def _spelt(unit: str) -> str:
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:
-    """(factor, offset) by which a value in ``unit`` becomes one in ``target``.
-
-    Raises:
-        InputError: the unit is unknown, missing, or of another quantity.
-    """
+    """(factor, offset) by which a value in ``unit`` becomes one in ``target``. Raises InputError: the unit is unknown,
+    missing, or of another quantity."""
     unit = _spelt(unit)
     if unit == target:
         return 1.0, 0.0

@@ -61,11 +61,8 @@ def frame_of(corner: Corner, shared: np.void | None, time_s: int) -> Frame:
 def data_of(
     configuration: Path, state: Path, corners: list[Corner], shared: PresentEstimates
 ) -> dict[int, Callable[[], bytes]]:
-    """Functions that read each data identifier, from files and estimates as they are at the time of the request.
-
-    Raises:
-        InputErrors: the configuration is faulty.
-    """
+    """Functions that read each data identifier, from files and estimates as they are at the time of the request. Raises
+    InputErrors: the configuration is faulty."""
     memory, corners_of = Memory(state), Setup(configuration).configuration.corners
 
     def calibration(name: str) -> bytes:

@@ -137,7 +137,7 @@ class Slave:
             if len(packet) <= command.layout.size:
                 raise Refusal(SYNTAX)
             self._packet = packet
-            return bytes([_RESPONSE]) + command.action(self, *command.layout.unpack_from(packet, 1))
+            return bytes([_RESPONSE]) + (command.action(self, *command.layout.unpack_from(packet, 1)) or b"")
         except Refusal as refusal:
             return bytes([_ERROR, *refusal.args])
 
@@ -152,14 +152,13 @@ class Slave:
         resource = _ACQUISITION | _CALIBRATION * (self._segment is not None)
         return struct.pack("<BBBHBB", resource, _MODE, self._transport.max_cto, self._transport.max_dto, _VERSION, _VERSION)
 
-    def _disconnect(self) -> bytes:
+    def _disconnect(self) -> None:
         self.end()
-        return b""
 
     def _status(self) -> bytes:
         return struct.pack("<BBxH", _DAQ_RUNNING * self.acquiring, 0, 0)
 
-    def _synch(self) -> bytes:
+    def _synch(self) -> None:
         raise Refusal(SYNCH)
 
     def _communication_mode(self) -> bytes:
@@ -174,9 +173,8 @@ class Slave:
     def _offer(self, text: bytes) -> None:
         self._address, self._text = (_TEXT, 0), text
 
-    def _set_address(self, extension: int, address: int) -> bytes:
+    def _set_address(self, extension: int, address: int) -> None:
         self._address = extension, address
-        return b""
 
     def _upload(self, count: int) -> bytes:
         extension, address = self._address
@@ -193,14 +191,14 @@ class Slave:
             return content
         return self._memory.read(extension, address, count)
 
-    def _download(self, count: int) -> bytes:
-        return self._write(count, 2)
+    def _download(self, count: int) -> None:
+        self._write(count, 2)
 
-    def _short_download(self, count: int, extension: int, address: int) -> bytes:
+    def _short_download(self, count: int, extension: int, address: int) -> None:
         self._address = extension, address
-        return self._write(count, 8)
+        self._write(count, 8)
 
-    def _write(self, count: int, header: int) -> bytes:
+    def _write(self, count: int, header: int) -> None:
         """Write ``count`` bytes that follow ``header`` bytes of the packet."""
         (extension, address), content = self._address, self._packet[header : header + count]
         if not 0 < count <= self._transport.max_cto - header:
@@ -213,14 +211,13 @@ class Slave:
             raise Refusal(WRITE_PROTECTED)
         self._check_taken(self._segment.write(address, content))
         self._address = extension, address + count
-        return b""
 
     @staticmethod
     def _check_taken(answer: Answer) -> None:
         if answer.refused:
             raise Refusal(NOT_NOW if answer.later else OUT_OF_RANGE)
 
-    def _set_page(self, mode: int, segment: int, page: int) -> bytes:
+    def _set_page(self, mode: int, segment: int, page: int) -> None:
         if not mode & (_BY_DAEMON | _BY_MASTER) or mode & ~(_BY_DAEMON | _BY_MASTER | _ALL_SEGMENTS):
             raise Refusal(MODE_NOT_VALID)
         self._check_page(0 if mode & _ALL_SEGMENTS else segment, page)
@@ -228,7 +225,6 @@ class Slave:
             self._check_taken(self._segment.use(page))
         if mode & _BY_MASTER:
             self._segment.shown = page
-        return b""
 
     def _page(self, mode: int, segment: int) -> bytes:
         if mode not in (_BY_DAEMON, _BY_MASTER):
@@ -256,14 +252,13 @@ class Slave:
         self._check_page(segment, page)
         return bytes([_WRITABLE if page == WORKING else _READ_ONLY, 0])
 
-    def _copy_page(self, from_segment: int, from_page: int, to_segment: int, to_page: int) -> bytes:
+    def _copy_page(self, from_segment: int, from_page: int, to_segment: int, to_page: int) -> None:
         self._check_page(from_segment, from_page)
         self._check_page(to_segment, to_page)
         if to_page != WORKING or self._segment.used == WORKING:
             raise Refusal(WRITE_PROTECTED)
         if from_page == FILES:
             self._segment.fill()
-        return b""
 
     def _page_processor(self) -> bytes:
         """One segment, none of whose pages can be frozen."""
@@ -301,26 +296,23 @@ class Slave:
         if self._step not in before:
             raise Refusal(SEQUENCE)
 
-    def _free(self) -> bytes:
+    def _free(self) -> None:
         self._lists, self._step, self._pointer = [], _FREED, None
-        return b""
 
-    def _allocate_lists(self, count: int) -> bytes:
+    def _allocate_lists(self, count: int) -> None:
         self._check_step(_FREED)
         if count > LISTS:
             raise Refusal(MEMORY_OVERFLOW)
         self._lists, self._step = [_List() for _ in range(count)], _LISTS_ALLOCATED
-        return b""
 
-    def _allocate_odts(self, number: int, count: int) -> bytes:
+    def _allocate_odts(self, number: int, count: int) -> None:
         self._check_step(_LISTS_ALLOCATED, _ODTS_ALLOCATED)
         chosen = self._list(number, idle=True)
         if sum(len(other.odts) for other in self._lists if other is not chosen) + count > self._transport.odts:
             raise Refusal(MEMORY_OVERFLOW)
         chosen.odts, self._step = [[] for _ in range(count)], _ODTS_ALLOCATED
-        return b""
 
-    def _allocate_entries(self, number: int, odt: int, count: int) -> bytes:
+    def _allocate_entries(self, number: int, odt: int, count: int) -> None:
         self._check_step(_ODTS_ALLOCATED, _ENTRIES_ALLOCATED)
         chosen = self._list(number, idle=True)
         if odt >= len(chosen.odts):
@@ -328,16 +320,14 @@ class Slave:
         if sum(len(entries) for other in self._lists for entries in other.odts) + count > _ENTRIES:
             raise Refusal(MEMORY_OVERFLOW)
         chosen.odts[odt], self._step = [(0, 0, 0)] * count, _ENTRIES_ALLOCATED
-        return b""
 
-    def _set_pointer(self, number: int, odt: int, entry: int) -> bytes:
+    def _set_pointer(self, number: int, odt: int, entry: int) -> None:
         chosen = self._list(number, idle=True)
         if odt >= len(chosen.odts) or entry >= len(chosen.odts[odt]):
             raise Refusal(OUT_OF_RANGE)
         self._pointer = number, odt, entry
-        return b""
 
-    def _write_entry(self, bit: int, size: int, extension: int, address: int) -> bytes:
+    def _write_entry(self, bit: int, size: int, extension: int, address: int) -> None:
         if self._pointer is None:
             raise Refusal(SEQUENCE)
         number, odt, entry = self._pointer
@@ -348,16 +338,14 @@ class Slave:
             raise Refusal(ACCESS_DENIED)
         entries[entry] = extension, address, size
         self._pointer = number, odt, entry + 1
-        return b""
 
-    def _set_mode(self, mode: int, number: int, event: int, prescaler: int, priority: int) -> bytes:
+    def _set_mode(self, mode: int, number: int, event: int, prescaler: int, priority: int) -> None:
         chosen = self._list(number, idle=True)
         if mode & ~_TIMESTAMP:
             raise Refusal(MODE_NOT_VALID)
         if event >= len(CORNERS) or not prescaler or priority:
             raise Refusal(OUT_OF_RANGE)
         chosen.event, chosen.timestamps, chosen.prescaler = event, bool(mode), prescaler
-        return b""
 
     def _mode(self, number: int) -> bytes:
         chosen = self._list(number)
@@ -376,7 +364,7 @@ class Slave:
             chosen.run(bool(mode))
         return bytes([self._first_odt(number)])
 
-    def _start_stop(self, mode: int) -> bytes:
+    def _start_stop(self, mode: int) -> None:
         """0: stop all; 1, 2: start, stop those that are selected."""
         if mode > 2:
             raise Refusal(MODE_NOT_VALID)
@@ -388,7 +376,6 @@ class Slave:
         for chosen in concerned:
             chosen.run(mode == 1)
             chosen.selected = False
-        return b""
 
     def _check(self, chosen: _List) -> None:
         """Refuse a list that no frame can carry, or that has no event."""
@@ -430,14 +417,14 @@ class Slave:
 
 
 class Command(NamedTuple):
-    """A command's code, the fields that follow it in a packet, and the function that gives the response after byte 0."""
+    """A command's code, the fields that follow it in a packet, and the function that gives the response behind byte 0."""
 
     code: int
     layout: struct.Struct
-    action: Callable[..., bytes]
+    action: Callable[..., bytes | None]
 
 
-def _table(rows: Iterable[tuple[str, int, str, Callable[..., bytes]]]) -> dict[str, Command]:
+def _table(rows: Iterable[tuple[str, int, str, Callable[..., bytes | None]]]) -> dict[str, Command]:
     return {name: Command(code, struct.Struct("<" + layout), action) for name, code, layout, action in rows}
 
 

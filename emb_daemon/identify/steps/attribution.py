@@ -99,13 +99,13 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
     if bench.episodes < EPISODES:
         return _unsearched(hot, known)
     found = diagnose_bench(bench, None, progress)
-    contact = _contact(found.selection, known, len(logs))
+    contact, residual = _contact(found.selection, known, len(logs)), found.selection.model.residual["stiffness"]
     calibration = replace(found.calibration, contact=contact, noise=known.noise, provenance=None)
     return AttributionStep(
         sigmas=found.calibration.provenance.sigmas,
         calibration=calibration,
         diagnosis=found,
-        hot=tuple(_errors(bench, found.residual["stiffness"], index) for index in range(len(logs), len(bench.trials))),
+        hot=tuple(_errors(bench, residual, index) for index in range(len(logs), len(bench.trials))),
         hot_current=_unexplained(hot, calibration),
         fastest_rad_per_s=_fastest(hot),
         undecided=undecided(found.selection),

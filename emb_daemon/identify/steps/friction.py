@@ -1,7 +1,5 @@
 """Pad-on-disc friction coefficient over clamp force, disc speed and surface temperature, for service (thesis 8.5)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from emb_daemon.calibration.types import FrictionTable
@@ -38,31 +36,6 @@ _CLOUD = Style("#aab4c0", mode="markers", size=3.0)
 _DOTS = Style("rgba(11,92,173,0.35)", mode="markers", size=3.5)
 
 
-@dataclass(frozen=True)
-class FrictionFit:
-    """Friction coefficient.
-
-    Attributes:
-        values: the table by the calibration's keys. Its grid runs evenly from standstill, zero force and the coldest surface
-            to a quarter beyond the largest values measured; outside of the data it follows the smooth model, limited to values
-            between a third of its value at the mean of the data and 1.
-        equation: the smooth model, for the report.
-        sigma: standard deviation of the coefficient at a typical grid point inside the data, pieces of data left out in turn.
-        force_N, speed_rad_per_s, temperature_C, measured, model: of each fitted row.
-        rms: of measured minus model, weighted by force.
-    """
-
-    values: dict[str, float]
-    equation: str
-    sigma: float
-    force_N: np.ndarray
-    speed_rad_per_s: np.ndarray
-    temperature_C: np.ndarray
-    measured: np.ndarray
-    model: np.ndarray
-    rms: float
-
-
 def _rows(r: Recording, parameters: np.void) -> np.ndarray:
     surface = simulate(parameters, r)[:, 9:11].mean(axis=1)
     braking = r.touching & (r.force > _LEAST_FORCE_N) & (r.speed > _LEAST_SPEED_RAD_PER_S)
@@ -82,54 +55,68 @@ def _rows(r: Recording, parameters: np.void) -> np.ndarray:
     return np.array([force, speed, averaged(surface), averaged(r.power) / (2.0 * radius * averaged(r.force * r.speed))])
 
 
-class _Surface:
-    """Coefficient as a polynomial of force, speed and temperature, each normalised by its mean and spread."""
+class FrictionFit:
+    """Friction coefficient as a polynomial of force, speed and temperature, each normalised by its mean and spread: linear,
+    and quadratic in temperature if that lowers the error on pieces of data left out in turn.
 
-    def __init__(self, force, speed, temperature, coefficient):
-        self.columns, self.coefficient = np.array([force, speed, temperature]), coefficient
-        self.centre = self.columns.mean(axis=1)
-        self.width = np.maximum(self.columns.std(axis=1), [1.0, 1e-3, 1e-3])
-        self.weight = force / force.max()
-        self.piece = np.arange(len(force)) * _PIECES // len(force)
-        left_out = {bent: self._left_out(bent) for bent in (False, True)}
+    Args:
+        rows: of steady braking, (force N, speed rad/s, temperature degC, coefficient), shape (4, n). They are weighted by
+            force, because the torque sensor's noise is constant.
+
+    Attributes:
+        temperature_C, measured, model: of each row.
+        sigma: standard deviation of the coefficient at a typical row, pieces of data left out in turn.
+        rms: of measured minus model, weighted by force.
+    """
+
+    def __init__(self, rows: np.ndarray):
+        self._columns = rows[:3]
+        force, self.temperature_C, self.measured = rows[0], rows[2], rows[3]
+        self._centre = self._columns.mean(axis=1)
+        self._width = np.maximum(self._columns.std(axis=1), [1.0, 1e-3, 1e-3])
+        self._weight = force / force.max()
+        self._piece = np.arange(len(force)) * _PIECES // len(force)
+        left_out = {bent: np.array([self._solve(self._piece != k, bent) for k in range(_PIECES)]) for bent in (False, True)}
         error = {bent: self._left_out_error(terms, bent) for bent, terms in left_out.items()}
-        self.bent = error[True] < _WORTH_IT * error[False]
-        self.terms = self._solve(np.ones(len(force), bool), self.bent)
-        design = self._design(self.columns, self.bent)
-        self.model = design @ self.terms
-        covariance = left_out_covariance(left_out[self.bent])
+        self._bent = error[True] < _WORTH_IT * error[False]
+        self._terms = self._solve(np.ones(len(force), bool), self._bent)
+        design = self._design(self._columns, self._bent)
+        self.model: np.ndarray = design @ self._terms
+        covariance = left_out_covariance(left_out[self._bent])
         self.sigma = float(np.sqrt(np.mean(np.einsum("ti,ij,tj->t", design, covariance, design))))
+        self.rms = rmse(self.model - self.measured, force**2)
 
     def _design(self, columns, bent):
-        u = [(column - c) / w for column, c, w in zip(columns, self.centre, self.width, strict=True)]
+        u = [(column - c) / w for column, c, w in zip(columns, self._centre, self._width, strict=True)]
         return np.stack([np.ones_like(u[0]), *u] + ([u[2] ** 2 - 1.0] if bent else []), axis=-1)
 
     def _solve(self, use, bent):
         """Weighted least squares, with a prior of mean zero for each term but the first."""
-        bend = [_EXPECTED_BEND * self.width[2] ** 2] if bent else []
-        expected = np.array([1e3, *(_EXPECTED_SLOPES * self.width), *bend])
-        weight = self.weight[use] / _ROW_SIGMA
-        left = np.concatenate([self._design(self.columns[:, use], bent) * weight[:, None], np.diag(1.0 / expected)])
-        return np.linalg.lstsq(left, np.concatenate([self.coefficient[use] * weight, 0.0 * expected]), rcond=None)[0]
-
-    def _left_out(self, bent):
-        return np.array([self._solve(self.piece != k, bent) for k in range(_PIECES)])
+        bend = [_EXPECTED_BEND * self._width[2] ** 2] if bent else []
+        expected = np.array([1e3, *(_EXPECTED_SLOPES * self._width), *bend])
+        weight = self._weight[use] / _ROW_SIGMA
+        left = np.concatenate([self._design(self._columns[:, use], bent) * weight[:, None], np.diag(1.0 / expected)])
+        return np.linalg.lstsq(left, np.concatenate([self.measured[use] * weight, 0.0 * expected]), rcond=None)[0]
 
     def _left_out_error(self, terms, bent):
-        predicted = np.sum(self._design(self.columns, bent) * terms[self.piece], axis=1)
-        return rmse(predicted - self.coefficient, self.weight**2)
+        predicted = np.sum(self._design(self._columns, bent) * terms[self._piece], axis=1)
+        return rmse(predicted - self.measured, self._weight**2)
 
-    def table(self) -> dict[str, float]:
-        most, coldest = _BEYOND * self.columns.max(axis=1), float(self.columns[2].min())
+    @property
+    def values(self) -> dict[str, float]:
+        """The table by the calibration's keys. Its grid runs evenly from standstill, zero force and the coldest surface to a
+        quarter beyond the largest values measured; outside of the data it follows the smooth model, limited to values between
+        a third of its value at the mean of the data and 1."""
+        most, coldest = _BEYOND * self._columns.max(axis=1), float(self._columns[2].min())
         force, speed = np.linspace(0.0, most[0], FORCE_GRID), np.linspace(0.0, most[1], SPEED_GRID)
-        hottest = coldest + _BEYOND * np.ptp(self.columns[2]) + 1.0
+        hottest = coldest + _BEYOND * np.ptp(self._columns[2]) + 1.0
         temperature = np.linspace(coldest, hottest, TEMPERATURE_GRID)
         mesh = np.meshgrid(force, speed, temperature, indexing="ij")
         table = {
             "force_N": force,
             "disc_speed_rad_per_s": speed,
             "surface_temperature_C": temperature,
-            "coefficient": np.clip(self._design(mesh, self.bent) @ self.terms, self.terms[0] / 3.0, 1.0),
+            "coefficient": np.clip(self._design(mesh, self._bent) @ self._terms, self._terms[0] / 3.0, 1.0),
         }
         return {
             f"thermal.friction.{name}" + "".join(f"[{index}]" for index in at): rounded(value, 5)
@@ -137,26 +124,24 @@ class _Surface:
             for at, value in np.ndenumerate(values)
         }
 
+    @property
     def equation(self) -> str:
-        slopes, centre = self.terms[1:4] / self.width, self.centre
+        """The smooth model, for the report."""
+        slopes, centre = self._terms[1:4] / self._width, self._centre
         text = (
-            f"μ = {self.terms[0]:.4f} {1e3 * slopes[0]:+.2e} (F − {1e-3 * centre[0]:.2f} kN)/kN"
+            f"μ = {self._terms[0]:.4f} {1e3 * slopes[0]:+.2e} (F − {1e-3 * centre[0]:.2f} kN)/kN"
             f" {slopes[1]:+.2e} (ω − {centre[1]:.1f} rad/s) s {slopes[2]:+.2e} (T − {centre[2]:.0f} °C)/K"
         )
-        if self.bent:
-            square = self.width[2] ** 2
-            text += f" {self.terms[4] / square:+.1e} ((T − {centre[2]:.0f})² − {square:.0f})/K²"
+        if self._bent:
+            square = self._width[2] ** 2
+            text += f" {self._terms[4] / square:+.1e} ((T − {centre[2]:.0f})² − {square:.0f})/K²"
         return text
 
 
 def fit_friction(recordings: list[Recording], parameters: np.void) -> FrictionFit:
     """Friction coefficient from brake torque, clamp force and the modelled surface temperature (mean of both pads).
 
-    The friction power of a recording is torque times speed.
-
-    A smooth model is tabulated, because a table filled from data would have empty corners: linear in force, speed and
-    temperature, and quadratic in temperature if that lowers the error on pieces of data left out in turn. Rows are weighted by
-    force, because the torque sensor's noise is constant.
+    A smooth model is tabulated, because a table filled from data would have empty corners.
 
     Args:
         recordings: those with `Recording.dense`.
@@ -165,22 +150,11 @@ def fit_friction(recordings: list[Recording], parameters: np.void) -> FrictionFi
     Raises:
         InputError: too little steady braking.
     """
-    force, speed, temperature, coefficient = np.concatenate([_rows(r, parameters) for r in recordings], axis=1)
-    if len(force) < _LEAST_ROWS:
+    rows = np.concatenate([_rows(r, parameters) for r in recordings], axis=1)
+    if rows.shape[1] < _LEAST_ROWS:
         names = ", ".join(r.name for r in recordings)
-        raise InputError(f"{names}: {len(force)} moments of steady braking; at least {_LEAST_ROWS} are needed for friction")
-    surface = _Surface(force, speed, temperature, coefficient)
-    return FrictionFit(
-        values=surface.table(),
-        equation=surface.equation(),
-        sigma=surface.sigma,
-        force_N=force,
-        speed_rad_per_s=speed,
-        temperature_C=temperature,
-        measured=coefficient,
-        model=surface.model,
-        rms=rmse(surface.model - coefficient, force**2),
-    )
+        raise InputError(f"{names}: {rows.shape[1]} moments of steady braking; at least {_LEAST_ROWS} are needed for friction")
+    return FrictionFit(rows)
 
 
 def constant_friction(coefficient: float) -> FrictionTable:

@@ -13,6 +13,7 @@ from emb_daemon.calibration.types import Calibration, Disc, Pad, Softening, Ther
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.identify.campaign_file import Datasheet
+from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.friction import constant_friction
 from emb_daemon.identify.text import rounded
 from emb_daemon.offline.fit import Block, Free, fit
@@ -66,20 +67,6 @@ UNKNOWNS = {
 _OF_DISC = [key for key in UNKNOWNS if ".disc." in key or "contact_conductance" in key or "gap_conductance" in key]
 
 
-@dataclass(frozen=True)
-class HeatFit:
-    """Pads and disc.
-
-    Attributes:
-        values, sigmas: by key (`UNKNOWNS`), of those that are fitted.
-        unexcited: keys of values that the logs do not show.
-    """
-
-    values: dict[str, float]
-    sigmas: dict[str, float]
-    unexcited: tuple[str, ...]
-
-
 def nominal_thermal(sheet: Datasheet) -> Thermal:
     """The datasheet's values, and usual values of what no datasheet states: starting values of fits, and final values without
     logs.
@@ -124,8 +111,8 @@ def check_excitation(r: Recording) -> None:
         raise InputError(f"{r.name}: {what} by {rise:.0f} K; at least {_LEAST_RISE_K:.0f} K by braking are needed")
 
 
-def fit_heat(recordings: list[Recording], start: Calibration) -> HeatFit:
-    """Pads and disc from recordings that heat and cool them.
+def fit_heat(recordings: list[Recording], start: Calibration) -> Step:
+    """Pads and disc from recordings that heat and cool them; notes name what the logs do not show.
 
     Residuals are strongly correlated and the equations approximate, so that a whole log counts as one episode, or, with fewer
     than four logs, one sixth of each. Of discs alone nothing inside the pads is fitted: they would take whatever the disc's
@@ -135,8 +122,10 @@ def fit_heat(recordings: list[Recording], start: Calibration) -> HeatFit:
     pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES
     blocks = [_block(r, start, pieces, told) for r in recordings]
     found = fit(blocks, {key: _free(UNKNOWNS[key], value_of(start, key)) for key in told}, tolerance=1e-4)
-    unexcited = tuple(key for key in UNKNOWNS if found.from_prior.get(key, 1.0) > _UNEXCITED)
-    return HeatFit({key: rounded(value, 6) for key, value in found.values.items()}, found.sigmas, unexcited)
+    unexcited = [key for key in UNKNOWNS if found.from_prior.get(key, 1.0) > _UNEXCITED]
+    kept = "these logs hardly tell it; the usual value, or the datasheet's, was mostly kept"
+    values = {key: rounded(value, 6) for key, value in found.values.items()}
+    return Step(values=values, sigmas=found.sigmas, notes=tuple(f"{key}: {kept}" for key in unexcited))
 
 
 def _free(unknown: _Unknown, start: float) -> Free:

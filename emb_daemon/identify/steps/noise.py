@@ -4,17 +4,15 @@ The daemon's standard deviation is judged against a reference instrument and mus
 errors on held-out data do.
 """
 
-from collections.abc import Mapping
-from types import MappingProxyType
-
 import numpy as np
 
 from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import EPISODE, Errors, errors_unseen
+from emb_daemon.identify.dynamics import EPISODE, errors_unseen
 from emb_daemon.identify.steps import Step
+from emb_daemon.identify.steps.attribution import AttributionStep
 from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import USUAL_RELAXATION_S, StiffnessStep
 from emb_daemon.identify.steps.torque import UNKNOWN_CURRENT_A, TorqueStep, Unexplained, unexplained_current
@@ -27,7 +25,6 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
-NOTHING: Mapping[str, float] = MappingProxyType({})
 #: One minus the squared friction state below which a gear slides.
 _SLID = 0.1
 #: Relative error of an extrapolated curve from which a note is written: the usual relative noise of the path.
@@ -44,20 +41,15 @@ def identify(
     torque: TorqueStep,
     folds: list[Fold],
     interpolation: float,
-    hot: tuple[Errors, ...] = (),
-    hot_current: tuple[Unexplained, ...] = (),
-    undecided: Mapping[str, float] = NOTHING,
-    fastest_rad_per_s: float = 0.0,
+    found: AttributionStep | None = None,
 ) -> Step:
     """Noise levels from the folds, or where there are none from the second halves of the random logs, or from slow logs.
 
     Args:
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
-        hot: errors of the whole model on logs with hot pads; used where they are larger than those of cold pads.
-        hot_current: current that is unexplained there; likewise.
-        undecided: relative force by which alternative models differ, by key.
-        fastest_rad_per_s: speed of the motor in the hardest clamp of the ``hot`` logs.
+        found: the search, once it is done; what it leaves of hot pads is used where it is larger than that of cold pads.
     """
+    found = found or AttributionStep(calibration=stiffness.fit.calibration)
     logs = [log for pads in stiffness.pads for log in pads.logs]
     known, notes = stiffness.fit.calibration, []
     speed = speed_noise(logs)
@@ -82,7 +74,7 @@ def identify(
     # What a relative error explains by the reference's force the daemon does not know where the path tells of none.
     none = np.abs(force + error) < floor
     floor = max(floor, rmse(error[none])) if none.any() else floor
-    more = [(error, force) for error, force in hot if rmse(error) > rmse(np.hypot(floor, relative * force))]
+    more = [(error, force) for error, force in found.hot if rmse(error) > rmse(np.hypot(floor, relative * force))]
     if more:
         errors = [*errors, *more]
         floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))
@@ -90,12 +82,12 @@ def identify(
         "stiffness_N": floor,
         "stiffness_relative": float(np.hypot(relative, interpolation)),
         "stiffness_correlation_s": integral_time([error for error, _ in errors]),
-        **torque_levels(held_out + _more_current(held_out, hot_current), gear_gain, speed),
-        "torque_lasting": _lasting([*held_out, *hot_current], gear_gain, known.stiffness.maximum_force_N),
+        **torque_levels(held_out + _more_current(held_out, found.hot_current), gear_gain, speed),
+        "torque_lasting": _lasting([*held_out, *found.hot_current], gear_gain, known.stiffness.maximum_force_N),
     }
     if not any(pads.random for pads in stiffness.pads):
         levels["stiffness_relative"] = float(
-            np.hypot(levels["stiffness_relative"], _unknown_lag(stiffness, campaign, fastest_rad_per_s))
+            np.hypot(levels["stiffness_relative"], _unknown_lag(stiffness, campaign, found.fastest_rad_per_s))
         )
         notes.append(
             "No random log: the stiffness path's relative noise holds what an unknown relaxation does in a hard clamp."
@@ -112,7 +104,7 @@ def identify(
     # The daemon does not know how worn its gear is.
     levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
     values = {f"noise.{name}": value for name, value in levels.items()}
-    values |= {key: float(np.hypot(values[key], share)) for key, share in undecided.items()}
+    values |= {key: float(np.hypot(values[key], share)) for key, share in found.undecided.items()}
     return Step(values=values, notes=tuple(notes))
 
 

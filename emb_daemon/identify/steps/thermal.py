@@ -21,7 +21,7 @@ from emb_daemon.identify.campaign import NEED_INTEGRATED, Campaign
 from emb_daemon.identify.steps import Step, cooling, friction, softening
 from emb_daemon.identify.steps.cooling import CoolingLaw, cooling_law
 from emb_daemon.identify.steps.friction import FrictionFit, fit_friction
-from emb_daemon.identify.steps.heat import HeatFit, check_excitation, fit_heat
+from emb_daemon.identify.steps.heat import check_excitation, fit_heat
 from emb_daemon.identify.steps.softening import SofteningFit, fit_softening
 from emb_daemon.identify.text import rounded, with_sigma
 from emb_daemon.offline import Log, estimate
@@ -76,7 +76,7 @@ class ThermalStep(Step):
     terms: tuple[Term, ...] = ()
     left_K: float = 0.0
     follows: str = ""
-    heat: HeatFit | None = None
+    heat: Step | None = None
     law: CoolingLaw | None = None
     friction: FrictionFit | None = None
     softening: SofteningFit | None = None
@@ -268,14 +268,10 @@ def _as_in_a_car(log: Log, calibration: Calibration) -> float:
 
 
 def _notes(heat, law, rubbed, softened) -> tuple[str, ...]:
-    notes = [
-        f"{key}: these logs hardly tell it; the usual value, or the datasheet's, was mostly kept" for key in heat.unexcited
-    ]
+    told = "thermal.friction: no log tells it; the datasheet's coefficient was kept"
     if rubbed:
-        notes.append(f"friction on the disc: {rubbed.equation}, residual {rubbed.rms:.4f}")
-    else:
-        notes.append("thermal.friction: no log tells it; the datasheet's coefficient was kept")
-    return (*notes, *([law.note()] if law else []), *([softened.note()] if softened else []))
+        told = f"friction on the disc: {rubbed.equation}, residual {rubbed.rms:.4f}"
+    return (*heat.notes, told, *(found.note() for found in (law, softened) if found))
 
 
 def section(page: Page, step: ThermalStep, calibration: Calibration) -> None:

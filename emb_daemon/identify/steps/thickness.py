@@ -49,11 +49,8 @@ class ThicknessStep(Step):
 
 
 def load_pads(campaign: Campaign) -> list[Pads]:
-    """Slow and random logs by pad thickness, thinnest first.
-
-    Raises:
-        InputError: none can serve, or the campaign's pads are too far from every measured thickness.
-    """
+    """Slow and random logs by pad thickness, thinnest first. Raises InputError: none can serve, or the campaign's pads are too
+    far from every measured thickness."""
     logs: dict[float, list] = {}
     for entries, part, need, reversals in (
         (campaign.file.curves, "curves", _NEED_CURVE, SLOW),
