@@ -17,7 +17,7 @@ import numpy as np
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
-from emb_daemon.diagnose.episodes import episodes, standing
+from emb_daemon.diagnose.episodes import episodes, standing, yielding
 from emb_daemon.diagnose.evidence import Averaging
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.speeds import denoised
@@ -80,9 +80,10 @@ class Trial:
     temperature_rows: np.ndarray
     temperature_C: np.ndarray
     brake_torque_Nm: np.ndarray
-    #: Where the motor stands, and where the friction of the gear has turned over.
+    #: Where the motor stands, where the friction of the gear has turned over, and where the load has turned it back, unseen.
     stands: np.ndarray
     slides: np.ndarray
+    yields: np.ndarray
     #: What the calibration says otherwise of this log alone, by key: pads of another thickness, and their clearance.
     mounted: Mapping[str, float]
 
@@ -99,8 +100,15 @@ def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, 
     clamping = force if known else run_step(log.samples, parameters)["force"]
     cut = episodes(log.time_s, np.nan_to_num(clamping), log.samples["angle"])
     stands = standing(log.time_s, log.samples["angle"])
-    slides = np.abs(run_paths(log.samples, parameters)["friction_mean"]) > _TURNED_OVER
-    return Trial(log, index, force, cut, rows, measured, torque, stands, slides, mounted)
+    friction = run_paths(log.samples, parameters)["friction_mean"]
+    level_N = _friction_N(parameters, np.nan_to_num(clamping))
+    yields = yielding(log.time_s, log.samples["angle"], np.nan_to_num(clamping), friction, (1.0 - _TURNED_OVER) * level_N)
+    return Trial(log, index, force, cut, rows, measured, torque, stands, np.abs(friction) > _TURNED_OVER, yields, mounted)
+
+
+def _friction_N(parameters: np.void, force_N: np.ndarray) -> np.ndarray:
+    """Clamp force whose load is as large as the gear's friction at each force, N, by PARAMETERS."""
+    return (parameters["offset_friction"] + parameters["load_friction"] * np.maximum(force_N, 0.0)) / parameters["gear_gain"]
 
 
 def count_over(episodes: Sequence[np.ndarray]) -> np.ndarray:
@@ -431,6 +439,9 @@ class Bench:
             load = left / (trace["torque_constant"] if per_ampere is None else per_ampere) * self.newton_per_ampere
         # The current is a mean over the cycle before its sample: of a longer way it tells the end.
         told = trial.log.samples["dt"] <= ONE_CYCLE_S
+        if self.clamps:
+            # What friction carries there no angle tells.
+            told &= ~trial.yields
         if self.turns_free:
             # Without a load friction holds a motor that stands, whatever its current below that of friction.
             told &= ~trial.stands
