@@ -64,6 +64,9 @@ _FAR, _SURELY = 2.0, 5.0
 #: by which they may be apart, as the estimate allows for (`models.alignment`): a whole one made 550 N of viscous friction
 #: that is not there. Share of a large acceleration from which the motor accelerates; holds tell nothing of the time.
 _LONGEST_MS, _WITHIN, _ACCELERATES = 60, 0.6, 0.1
+#: A current that is exactly nothing at least so often, and else never below so many of its own steps, has a dead band; and
+#: standard deviations of its noise above that from which noise no longer decides whether it is there.
+_LEAST_DEAD, _DEAD_STEPS, _CLEAR = 50, 10.0, 3.0
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -192,6 +195,15 @@ def _current_late_s(trial: Trial) -> float:
     return late_s if abs(late_s) > _WITHIN * max(CYCLE_S, float(np.median(samples["dt"]))) else 0.0
 
 
+def _dead_band_A(logs: Sequence[Log]) -> float:
+    """Current below which its sensor tells nothing, A; 0 where it tells any."""
+    current = np.abs(np.concatenate([log.samples["current_q"][log.samples["has_current"]] for log in logs]))
+    sizes = np.unique(current)[: _LEAST_DEAD + 1]
+    if len(sizes) <= 2 or sizes[0] > 0.0 or np.count_nonzero(current == 0.0) < _LEAST_DEAD:
+        return 0.0
+    return float(sizes[1]) if sizes[1] > _DEAD_STEPS * np.median(np.diff(sizes[1:])) else 0.0
+
+
 def _told_by_signals(logs: Sequence[Log], calibration: Calibration) -> dict[str, float]:
     """Amplitudes that signals alone tell (`Effect.measure`) and that are surely some samples from the calibration's."""
     result = {}
@@ -255,6 +267,8 @@ class Bench:
         #: Time by which the current comes after the motion that it causes, s; negative if the motion comes after it, and after
         #: the force. Nothing that is looked for explains a path of two times: what is found there is a shadow of that.
         self.current_late_s: float = max(late, key=abs)
+        #: Current below which its sensor tells nothing, A: friction that seems to need none there is no cause.
+        self.current_dead_A: float = _dead_band_A(logs)
         self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
@@ -439,6 +453,9 @@ class Bench:
             load = left / (trace["torque_constant"] if per_ampere is None else per_ampere) * self.newton_per_ampere
         # The current is a mean over the cycle before its sample: of a longer way it tells the end.
         told = trial.log.samples["dt"] <= ONE_CYCLE_S
+        if self.current_dead_A:
+            least_A = self.current_dead_A + _CLEAR * self.calibration.noise.current_A
+            told &= np.abs(trial.log.samples["current_q"]) > least_A
         if self.clamps:
             # What friction carries there no angle tells.
             told &= ~trial.yields
