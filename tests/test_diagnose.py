@@ -233,6 +233,24 @@ def test_current_and_motion_of_two_times_are_said_and_make_no_effect(calibration
 
 
 @pytest.mark.trial
+@pytest.mark.parametrize("seed", [57, 61])
+def test_a_dead_band_of_the_current_is_said_and_makes_no_effect(calibration, seed):
+    """Holds that seem to need no current are no friction that helps the motor."""
+
+    def dead(log):
+        rows = log.samples.copy()
+        rows["current_q"] = np.where(np.abs(rows["current_q"]) < 1.0, 0.0, rows["current_q"])
+        return dataclasses.replace(log, samples=rows)
+
+    fit_log, val_log = (dead(log_of(frames)) for frames in drives(calibration, seed, {}))
+    result = diagnose([fit_log], calibration, [val_log])
+    assert not result.accepted
+    assert report(result)["current_dead_A"] == pytest.approx(1.0, abs=0.02)
+    assert "above 1 A, a dead band" in verdict(result)
+    assert Bench([log_of(next(drives(calibration, seed, {})))], calibration).current_dead_A == 0.0
+
+
+@pytest.mark.trial
 def test_what_changed_of_a_calibrated_effect_is_named_with_before_and_after(calibration):
     """The pads relax three times as much as they were calibrated to."""
     share = calibration.effects["second_relaxation"]["share"]

@@ -89,10 +89,26 @@ def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):
     # The term has proven that something is there: too few episodes for the catalogue's own test do not speak against a name.
     monkeypatch.setattr("scipy.stats.false_discovery_control", np.ones_like)
     monkeypatch.setattr("emb_daemon.diagnose.selection.Q_VALUE", 0.0)
+    find_known = grammar.find_known
+
+    def misled(bare, channel):
+        """What gains more on a line that is far from all fits comes first, and describes it no better."""
+        stribeck = [effect for effect in REGISTRY if effect.name == "stribeck_friction"]
+        return [*bare.screening.test(bare.model, stribeck), *find_known(bare, channel)]
+
+    monkeypatch.setattr(grammar, "find_known", misled)
     named = revise(grammar._called_by_name(made, channel))
     assert named.accepted == ["viscous_friction"]
     assert named.candidates["viscous_friction"].q_value == made.candidates[term].q_value
     assert named.candidates[term].reason == "an effect of the catalogue says the same"
+
+
+def test_what_a_fit_has_left_at_nothing_is_no_effect(viscous):
+    """Its line may promise a gain that a bound, or what else was fitted, does not let it have."""
+    selection, _, _ = viscous
+    [amplitude] = selection.model.of_effect("viscous_friction")
+    stuck = dataclasses.replace(selection, model=selection.model.entered({amplitude: 1e-3 * amplitude.step}))
+    assert selection.model.of_effect("viscous_friction") and not revise(stuck).accepted
 
 
 def test_what_friction_does_as_it_turns_over_proves_no_effect(viscous, monkeypatch):

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from scipy.stats import f as f_distribution
 
 from emb_daemon.diagnose.confirmation import _fits_without
-from emb_daemon.diagnose.episodes import episodes
+from emb_daemon.diagnose.episodes import episodes, yielding
 from emb_daemon.diagnose.evidence import Averaging, Moments, judge, leave_out, leave_out_within, solve_within
 
 
@@ -312,3 +312,22 @@ def test_no_phase_of_a_manoeuvre_that_is_repeated_is_left_out_whole(phases):
     parts = [own for own, _ in _fits_without(SimpleNamespace(model=model, applied=lambda without: {}), "")]
     assert np.sum(parts, axis=0).tolist() == 10 * phases * [1]
     assert all(part.reshape(-1, phases).mean(axis=0).max() < 0.8 for part in parts)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_load_that_grows_against_a_motor_that_holds_turns_its_friction_back(way):
+    """Motor that closes (``way`` 1) or opens for a second, then holds for three, its load swinging as over an uneven disc."""
+    time = 0.004 * np.arange(1000)
+    moves, noise = time < 1.0, np.random.default_rng(0).normal(0.0, 25.0, len(time))
+    angle, friction = way * np.minimum(time, 1.0) * 20.0, np.full(len(time), way)
+
+    def of(force):
+        return yielding(time, angle, force + noise, friction, np.full(len(time), 400.0))
+
+    held = 8000.0 + 6000.0 * way * np.minimum(time - 1.0, 0.0)
+    swings = of(held - 300.0 * way * np.sin(2.0 * np.pi * np.maximum(time - 1.0, 0.0)))
+    assert not swings[time < 1.25].any() and swings[time > 1.75].all()
+    # Settling pads take load off a motor that closes: friction stays what it was, and so it does while the motor turns.
+    assert not of(held - 900.0 * way * np.maximum(time - 1.0, 0.0)).any()
+    assert not of(held - 300.0 * way * np.sin(2.0 * np.pi * time) * moves).any()
+    assert not of(held - 100.0 * way * np.sin(2.0 * np.pi * np.maximum(time - 1.0, 0.0))).any()

@@ -12,20 +12,26 @@ from diagnosekit import drives
 
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.diagnose import diagnosis
+from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.page import _left
 from emb_daemon.diagnose.residuals import Bench
-from emb_daemon.diagnose.screening import Screening
+from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.selection import Selection
 from emb_daemon.diagnose.signals import MANOEUVRES, smooth_basis
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.diagnose.unexplained import Dependence, Left, achieved
+from emb_daemon.effects.stribeck_friction import EFFECT
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.offline import log_of
 from emb_daemon.offline.score import rmse
+from emb_daemon.plant.derive import plant_from_calibration
+from emb_daemon.plant.scenarios import rest, simulate_log
 from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
+from studies.drives import rig_stop
+from studies.strangers import draw_brake
 
 
 def test_there_is_a_manoeuvre_for_every_signal():
@@ -105,6 +111,47 @@ def test_what_lasts_of_a_torque_is_that_of_sliding_friction(calibration):
     assert 0.01 < np.mean(~trial.slides) < 0.2
     assert rms_known(np.where(trial.slides, 0.0, 900.0), means) == 0.0
     assert rms_known(np.where(trial.slides, 100.0, 900.0), means) == pytest.approx(100.0)
+
+
+def test_an_uneven_disc_is_no_error_of_the_torque():
+    """It turns the friction of a gear that holds back and forth by less than a resolver tells: half a kilonewton that the gear
+    of a brake with much friction seems to have where force is held long, and no cause of its own."""
+    uneven = {"disc_thickness_variation": {"order_1_cosine_um": 12.0, "order_2_sine_um": 16.0}}
+    hidden = uneven | {"stribeck_friction": {"rise": 0.75, "speed_rad_per_s": 12.0}}
+    brake = draw_brake(np.random.default_rng(92))
+    high, schedule = brake.stiffness.maximum_force_N, rest(1.0)
+    for share in (0.3, 0.5, 0.2):
+        schedule += rig_stop(share * high, 50.0, 3.0, 6.5)
+    frames, _ = simulate_log(plant_from_calibration(brake, seed=92, effects=hidden), schedule, seed=92)
+    known = moved(brake, {f"effects.{e}.{k}": v for e, values in hidden.items() for k, v in values.items()})
+    bench = Bench([log_of(frames)], known)
+    means, [trial] = bench.means("torque", LASTING["torque"]), bench.trials
+    judged = bench.residuals({})["torque"]
+    trial.yields[:] = False
+    everything = bench.residuals({})["torque"]
+    apart = np.where(judged == everything, 0.0, everything)
+    assert rms_known(apart, means) > 400.0 > 2.0 * rms_known(judged, means)
+
+
+def test_a_second_cause_is_no_shadow_of_the_largest():
+    """A shadow says nothing beside a smooth function of what it is a shadow of; what follows something else keeps its gain."""
+    rng, count, length = np.random.default_rng(4), 40, 60
+    heat, speed = rng.uniform(0.0, 1.0, count * length), rng.uniform(-1.0, 1.0, count * length)
+    own, shadow = speed, (heat > 0.9).astype(float)
+    left = 800.0 * heat**2 + 400.0 * own + rng.normal(0.0, 50.0, count * length)
+    episode = np.repeat(np.arange(count), length)
+    bench = SimpleNamespace(episode={"torque": episode}, episodes=count, shows_turning=lambda channel: False)
+    model = Model(bench, {}, {"torque": left}, [])
+    screening = Screening.__new__(Screening)
+    screening.signals = {"caliper_temperature": heat, "clamp_force": np.full(count * length, 1.0)}
+    screening._size = {"torque": 1e3}
+    reasons = []
+    for column in (own, shadow):
+        evidence = model.evidence("torque", [column])
+        own = Coordinate("effects.any", "torque", 0.0, 1.0, np.inf, ())
+        found = Candidate(EFFECT, "torque", (own,), (), (column,), evidence, gain=model.rms(evidence.gain, "torque"))
+        reasons.append(screening.plausible(model, found, {}).reason)
+    assert not reasons[0] and "shadow of something else" in reasons[1]
 
 
 def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):

@@ -8,6 +8,7 @@ drag, a burst, a park brake stroke) into pieces of a few seconds; a hold is one 
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from emb_daemon.effects.terms import CLAMPED_N
 
@@ -20,6 +21,8 @@ _HOLDING_RAD, _HOLDING_S = 0.03, 0.25
 #: The motor stands where it turns less than a step of our message of its speed, 0.02 rad/s, for this time, s;
 #: number of places in it.
 _STILL_RAD_PER_S, _STILL_S, _STILL_PARTS = 0.02, 0.1, 5
+#: Samples over which the noise of a force is taken out: no disc changes it faster than in twenty milliseconds.
+_NOISE_SAMPLES = 5
 
 
 def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
@@ -74,6 +77,24 @@ def standing(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
             there = np.interp(time_s + way * part, time_s, angle_rad)
             still &= np.abs(there - angle_rad) < _STILL_RAD_PER_S * _STILL_S
     return stands[-1.0] | stands[1.0]
+
+
+def yielding(
+    time_s: np.ndarray, angle_rad: np.ndarray, force_N: np.ndarray, friction: np.ndarray, least_N: np.ndarray
+) -> np.ndarray:
+    """Mask of the samples, shape (N,), of a hold in which the load has turned the friction of the gear back by ``least_N`` or
+    more since the motor stopped: by less motion than a resolver tells, as an uneven disc does at each turn.
+
+    ``friction``: its state as the angle tells it, -1 to 1; while it opposes closing, a load that grows is what turns it."""
+    against = uniform_filter1d(force_N, _NOISE_SAMPLES) * np.where(friction < 0.0, -1.0, 1.0)
+    holds = _holding(time_s, angle_rad) & (force_N > CLAMPED_N)
+    cuts = np.flatnonzero((holds[1:] != holds[:-1]) | (np.signbit(friction[1:]) != np.signbit(friction[:-1]))) + 1
+    result = np.zeros(len(time_s), np.bool_)
+    for start, stop in pairwise([0, *cuts, len(time_s)]):
+        if holds[start]:
+            part = against[start:stop]
+            result[start:stop] = np.maximum.accumulate(part - np.minimum.accumulate(part) > least_N[start:stop])
+    return result
 
 
 def _holding(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

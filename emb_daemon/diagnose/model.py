@@ -101,6 +101,10 @@ class Model:
             chosen=self.chosen | frozenset(chosen),
         )
 
+    def says_nothing(self, amplitudes: Iterable[Coordinate]) -> bool:
+        """Whether a fit has left amplitudes at nothing, which a line may take for a gain: it knows no bound."""
+        return all(abs(self.values[c]) < c.step for c in amplitudes)
+
     def without(self, gone: Iterable[Coordinate]) -> "Model":
         """With some coordinates taken out again, not refitted."""
         gone = set(gone)

@@ -29,6 +29,7 @@ def report(diagnosis: Diagnosis) -> dict[str, Any]:
         "judged_on": diagnosis.judged_on,
         "reference": "clamp_force" if diagnosis.bench.has_reference else "innovation",
         "current_late_s": diagnosis.bench.current_late_s,
+        "current_dead_A": diagnosis.bench.current_dead_A,
         "effects": [_finding(diagnosis, finding) for finding in diagnosis.findings],
         "recalibrated": {key: _recalibrated(found) for key, found in diagnosis.recalibrated.items()},
         "stiffness_scale": diagnosis.stiffness_scale,

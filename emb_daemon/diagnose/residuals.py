@@ -17,7 +17,7 @@ import numpy as np
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
-from emb_daemon.diagnose.episodes import episodes, standing
+from emb_daemon.diagnose.episodes import episodes, standing, yielding
 from emb_daemon.diagnose.evidence import Averaging
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.speeds import denoised
@@ -64,6 +64,9 @@ _FAR, _SURELY = 2.0, 5.0
 #: by which they may be apart, as the estimate allows for (`models.alignment`): a whole one made 550 N of viscous friction
 #: that is not there. Share of a large acceleration from which the motor accelerates; holds tell nothing of the time.
 _LONGEST_MS, _WITHIN, _ACCELERATES = 60, 0.6, 0.1
+#: A current that is exactly nothing at least so often, and else never below so many of its own steps, has a dead band; and
+#: standard deviations of its noise above that from which noise no longer decides whether it is there.
+_LEAST_DEAD, _DEAD_STEPS, _CLEAR = 50, 10.0, 3.0
 #: Share of the samples that must have a value before a log counts as having the signal.
 _RECORDED = 0.1
 
@@ -80,9 +83,10 @@ class Trial:
     temperature_rows: np.ndarray
     temperature_C: np.ndarray
     brake_torque_Nm: np.ndarray
-    #: Where the motor stands, and where the friction of the gear has turned over.
+    #: Where the motor stands, where the friction of the gear has turned over, and where the load has turned it back, unseen.
     stands: np.ndarray
     slides: np.ndarray
+    yields: np.ndarray
     #: What the calibration says otherwise of this log alone, by key: pads of another thickness, and their clearance.
     mounted: Mapping[str, float]
 
@@ -99,8 +103,15 @@ def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, 
     clamping = force if known else run_step(log.samples, parameters)["force"]
     cut = episodes(log.time_s, np.nan_to_num(clamping), log.samples["angle"])
     stands = standing(log.time_s, log.samples["angle"])
-    slides = np.abs(run_paths(log.samples, parameters)["friction_mean"]) > _TURNED_OVER
-    return Trial(log, index, force, cut, rows, measured, torque, stands, slides, mounted)
+    friction = run_paths(log.samples, parameters)["friction_mean"]
+    level_N = _friction_N(parameters, np.nan_to_num(clamping))
+    yields = yielding(log.time_s, log.samples["angle"], np.nan_to_num(clamping), friction, (1.0 - _TURNED_OVER) * level_N)
+    return Trial(log, index, force, cut, rows, measured, torque, stands, np.abs(friction) > _TURNED_OVER, yields, mounted)
+
+
+def _friction_N(parameters: np.void, force_N: np.ndarray) -> np.ndarray:
+    """Clamp force whose load is as large as the gear's friction at each force, N, by PARAMETERS."""
+    return (parameters["offset_friction"] + parameters["load_friction"] * np.maximum(force_N, 0.0)) / parameters["gear_gain"]
 
 
 def count_over(episodes: Sequence[np.ndarray]) -> np.ndarray:
@@ -184,6 +195,15 @@ def _current_late_s(trial: Trial) -> float:
     return late_s if abs(late_s) > _WITHIN * max(CYCLE_S, float(np.median(samples["dt"]))) else 0.0
 
 
+def _dead_band_A(logs: Sequence[Log]) -> float:
+    """Current below which its sensor tells nothing, A; 0 where it tells any."""
+    current = np.abs(np.concatenate([log.samples["current_q"][log.samples["has_current"]] for log in logs]))
+    sizes = np.unique(current)[: _LEAST_DEAD + 1]
+    if len(sizes) <= 2 or sizes[0] > 0.0 or np.count_nonzero(current == 0.0) < _LEAST_DEAD:
+        return 0.0
+    return float(sizes[1]) if sizes[1] > _DEAD_STEPS * np.median(np.diff(sizes[1:])) else 0.0
+
+
 def _told_by_signals(logs: Sequence[Log], calibration: Calibration) -> dict[str, float]:
     """Amplitudes that signals alone tell (`Effect.measure`) and that are surely some samples from the calibration's."""
     result = {}
@@ -247,6 +267,8 @@ class Bench:
         #: Time by which the current comes after the motion that it causes, s; negative if the motion comes after it, and after
         #: the force. Nothing that is looked for explains a path of two times: what is found there is a shadow of that.
         self.current_late_s: float = max(late, key=abs)
+        #: Current below which its sensor tells nothing, A: friction that seems to need none there is no cause.
+        self.current_dead_A: float = _dead_band_A(logs)
         self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
@@ -431,6 +453,12 @@ class Bench:
             load = left / (trace["torque_constant"] if per_ampere is None else per_ampere) * self.newton_per_ampere
         # The current is a mean over the cycle before its sample: of a longer way it tells the end.
         told = trial.log.samples["dt"] <= ONE_CYCLE_S
+        if self.current_dead_A:
+            least_A = self.current_dead_A + _CLEAR * self.calibration.noise.current_A
+            told &= np.abs(trial.log.samples["current_q"]) > least_A
+        if self.clamps:
+            # What friction carries there no angle tells.
+            told &= ~trial.yields
         if self.turns_free:
             # Without a load friction holds a motor that stands, whatever its current below that of friction.
             told &= ~trial.stands

@@ -240,7 +240,11 @@ class Screening:
             if not c.low - 2.0 * sigma <= value <= c.high + 2.0 * sigma:
                 return replace(candidate, reason=f"{c.parameter} = {value:.3g} {c.unit} is outside what physics allows")
         gain, signal = self.rival(model, channel, rivals)
-        if evidence.gain < OF_MODEL_FREE * gain and _together(model, candidate, signal, tested) < OF_MODEL_FREE * gain:
+        if (
+            evidence.gain < OF_MODEL_FREE * gain
+            and _together(model, candidate, signal, tested) < OF_MODEL_FREE * gain
+            and self._gain_beside(model, candidate, signal) < OF_PLACEBO * evidence.gain
+        ):
             shadow = (
                 f"explains {candidate.gain:.3g} {unit} RMS where a smooth function of {signal} explains "
                 f"{model.rms(gain, channel):.3g} {unit}: a shadow of something else"
@@ -269,20 +273,30 @@ class Screening:
         ``samples``."""
         if channel not in FORCE_CHANNELS:
             return {}
-        own = model.movable(channel)
-        base, prior = [model.columns[c] for c in own], model.penalty(own, channel)
-        keep = model.residual[channel] != 0.0
         plain = model.left_out(channel, samples=samples)
-        result = {}
-        for name, signal in self.signals.items():
-            basis = smooth_basis(name, signal, self.signals["clamp_force"]) * keep[:, None]
-            if not basis.shape[1]:
-                continue
-            moments = model.moments(channel, [*base, basis], samples=samples)
-            size = np.einsum("gii->i", moments.products)[len(own) : -1]
-            penalty = np.concatenate([prior, 1e-3 * np.maximum(size, 1e-300) + 1e-12])
-            result[name] = (plain, leave_out(moments, penalty).left_out)
-        return result
+        with_ = {name: self._left_out_with(model, channel, name, samples=samples) for name in self.signals}
+        return {name: (plain, own) for name, own in with_.items() if own is not None}
+
+    def _left_out_with(
+        self, model: Model, channel: str, name: str, columns: Sequence[np.ndarray] = (), samples: int = 1
+    ) -> np.ndarray | None:
+        """Squared error of each left-out episode with a smooth function of a signal and other regressors, shape (episodes,);
+        None for a signal that does not vary."""
+        basis = smooth_basis(name, self.signals[name], self.signals["clamp_force"])
+        if not basis.shape[1]:
+            return None
+        own = model.movable(channel)
+        basis = basis * (model.residual[channel] != 0.0)[:, None]
+        moments = model.moments(channel, [*(model.columns[c] for c in own), *columns, basis], samples=samples)
+        size = np.einsum("gii->i", moments.products)[-1 - basis.shape[1] : -1]
+        prior = np.append(model.penalty(own, channel), np.zeros(len(columns)))
+        return leave_out(moments, np.append(prior, 1e-3 * np.maximum(size, 1e-300) + 1e-12)).left_out
+
+    def _gain_beside(self, model: Model, candidate: Candidate, signal: str) -> float:
+        """Gain of a candidate on left-out episodes beside a smooth function of a signal: a shadow of what that explains has
+        none, another cause keeps its own."""
+        alone, both = (self._left_out_with(model, candidate.channel, signal, own) for own in ((), candidate.columns))
+        return float((alone - both).sum())
 
     # -- placebos -----------------------------------------------------------------------------------------------------
 

@@ -139,7 +139,8 @@ class Selection:
             model = model.settled({*HEAT_CHANNELS, *channels})
         result = replace(self.noted(replace(winner, accepted=True) for winner in winners), model=model)
         for winner in winners:
-            if result.model.noise(winner.channel) >= before.noise(winner.channel):
+            own = [c for c in result.model.of_effect(winner.effect.name) if not is_shape(c)]
+            if result.model.noise(winner.channel) >= before.noise(winner.channel) or result.model.says_nothing(own):
                 reason = "no fit of it with the calibration's own parameters is better than without it"
                 result = result.without(winner.effect.name, reason)
         return result
@@ -214,15 +215,15 @@ def one_round(selection: Selection) -> Selection:
     return selection.entered(winners) if winners else _try_unsure(selection, tested, rivals)
 
 
-def find_known(selection: Selection, channel: str) -> Candidate | None:
-    """The effect that gains most in a channel, of all that are not in the model and that nothing but chance speaks against;
-    also of those that were dropped."""
+def find_known(selection: Selection, channel: str) -> list[Candidate]:
+    """The effects of a channel that are not in the model and that nothing but chance speaks against, those first that gain
+    most; also of those that were dropped."""
     model, screening = selection.model, selection.screening
     off = [e for e in REGISTRY if not model.of_effect(e.name) and not _why_not_asked(e, model)]
     found = [c for c in screening.test(model, off) if c.channel == channel and c.columns]
     rivals: dict = {}
     passed = [c for c in (screening.plausible(model, c, rivals, found) for c in found) if not c.reason]
-    return max(passed, key=lambda c: c.evidence.gain, default=None)
+    return sorted(passed, key=lambda c: -c.evidence.gain)
 
 
 def _why_not_asked(effect: Effect, model: Model) -> str:
@@ -343,7 +344,12 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
         # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter, and they must
         # agree; and so must what is gained where a prior alone says how large it is.
         by_chance = unclear if over_grammar else chance > Q_VALUE
-        if gain <= 0.0 or by_chance or (little and (over_grammar or not _is_carried(model, group))):
+        if (
+            gain <= 0.0
+            or model.says_nothing(group)
+            or by_chance
+            or (little and (over_grammar or not _is_carried(model, group)))
+        ):
             gone += group
             gains.append(gain / floor)
     return (max(gains), name, gone) if gone else None

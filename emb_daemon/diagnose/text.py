@@ -96,7 +96,7 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    parts = (_worse, _apart, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    parts = (_worse, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
 
@@ -116,6 +116,14 @@ def _apart(diagnosis: Diagnosis) -> list[str]:
         what = f"Angle and speed come {-late_ms:.0f} ms after the current that moves them"
         on = on if diagnosis.bench.channel_of("stiffness") else "either path"
     return [f"{what}: nothing is looked for on {on} until they are of one time."]
+
+
+def _dead(diagnosis: Diagnosis) -> list[str]:
+    """A sensor that says nothing of small currents."""
+    dead_A = diagnosis.bench.current_dead_A
+    if not dead_A:
+        return []
+    return [f"The current is either 0 or above {dead_A:.3g} A, a dead band: the torque path is judged where it is above."]
 
 
 def _outside(diagnosis: Diagnosis) -> list[str]:

@@ -90,8 +90,8 @@ class _Bench(Bench):
 
     def _trial(self, index: int, log: Log, mounted: Mapping[str, float]) -> Trial:
         """Not cut into episodes, for which the whole step would be run once more: a drive is one opinion."""
-        nothing = np.zeros(0)
-        return Trial(log, index, log.force_N, nothing, nothing, nothing, nothing, nothing, nothing, mounted)
+        nothing, never = np.zeros(0), np.zeros(len(log.samples), np.bool_)
+        return Trial(log, index, log.force_N, nothing, nothing, nothing, nothing, nothing, nothing, never, mounted)
 
     def parameters_of(self, trial: Trial, values: Values) -> np.void:
         others = tuple((c.name, value) for c, value in values.items() if c is not self._contact)
