@@ -11,10 +11,10 @@ from emb_daemon.estimator.hypotheses import fold, open_all
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT, CREEPS, GROWTH, OFFSET, SCALE, STATES, copy_errors
 
-#: Stops to go back: a filter shows in one to three strokes, and those that swing count as stops each. Of 132 phases of drives
-#: with currents and angles that are late or filtered (`studies.silent injected --count 8 --seed 12 --faults
-#: current_filtered,current_delayed,resolver_delayed,angle_filtered` on three recorded logs) 18 fail without going back, 13 with
-#: three stops and 9 with six.
+#: Stops to go back: a filter shows in one to three strokes, and those that swing count as stops each. Of 132 phases of three
+#: recorded logs with currents and angles that are late or filtered (`studies.silent injected --count 8 --seed 12 --faults
+#: current_filtered,current_delayed,resolver_delayed,angle_filtered`) 18 fail without going back, 13 with three stops and 9
+#: with six.
 STOPS = 6
 
 #: What was known at the end of a stop: the first hypothesis's errors and their covariance, and what the model had taken over.
