@@ -71,7 +71,9 @@ class FrictionFit:
 
     def __init__(self, rows: np.ndarray):
         self._columns = rows[:3]
-        force, self.temperature_C, self.measured = rows[0], rows[2], rows[3]
+        force = rows[0]
+        self.temperature_C: np.ndarray = rows[2]
+        self.measured: np.ndarray = rows[3]
         self._centre = self._columns.mean(axis=1)
         self._width = np.maximum(self._columns.std(axis=1), [1.0, 1e-3, 1e-3])
         self._weight = force / force.max()
@@ -83,8 +85,8 @@ class FrictionFit:
         design = self._design(self._columns, self._bent)
         self.model: np.ndarray = design @ self._terms
         covariance = left_out_covariance(left_out[self._bent])
-        self.sigma = float(np.sqrt(np.mean(np.einsum("ti,ij,tj->t", design, covariance, design))))
-        self.rms = rmse(self.model - self.measured, force**2)
+        self.sigma: float = float(np.sqrt(np.mean(np.einsum("ti,ij,tj->t", design, covariance, design))))
+        self.rms: float = rmse(self.model - self.measured, force**2)
 
     def _design(self, columns, bent):
         u = [(column - c) / w for column, c, w in zip(columns, self._centre, self._width, strict=True)]
