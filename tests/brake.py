@@ -89,6 +89,15 @@ def stops(p, count: int, seed: int = 1, dt: float = 0.004, held_s: float = 1.0) 
     return np.concatenate(parts)
 
 
+def filtered(values: np.ndarray, cycles: float) -> np.ndarray:
+    """Values through a first-order filter of so many samples."""
+    shown, state = np.empty_like(values), values[0]
+    for row, value in enumerate(values):
+        state += (value - state) / (1.0 + cycles)
+        shown[row] = state
+    return shown
+
+
 def lose_counts(rows: np.ndarray, share: float) -> None:
     """SAMPLE rows in which a ``share`` of the way is not counted while the motor closes, in place."""
     rows["angle"] -= share * np.cumsum(np.maximum(np.diff(rows["angle"], prepend=rows["angle"][0]), 0.0))

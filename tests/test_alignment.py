@@ -30,19 +30,10 @@ def _late(values, cycles):
     return np.interp(np.arange(len(values)) - cycles, np.arange(len(values)), values)
 
 
-def _filtered(values, cycles):
-    """Through a first-order filter of so many cycles."""
-    shown, state = np.empty_like(values), values[0]
-    for row, value in enumerate(values):
-        state += (value - state) / (1.0 + cycles)
-        shown[row] = state
-    return shown
-
-
 def _apart(torque, cycles):
     """Torque by a current through a filter, and by a motion with its noise; or that through one, if ``cycles`` is negative."""
     needed = torque + _NOISE * np.random.default_rng(3).standard_normal(len(torque))
-    return (_filtered(torque, cycles), needed) if cycles >= 0.0 else (torque, _filtered(needed, -cycles))
+    return (brake.filtered(torque, cycles), needed) if cycles >= 0.0 else (torque, brake.filtered(needed, -cycles))
 
 
 def _compare(shown, needed, a=None, noise=_NOISE):
@@ -76,7 +67,7 @@ def test_a_filter_within_what_the_estimate_allows_for_is_left(cycles):
     """However clear it is: a current that is late by a third of a cycle looks like it."""
     a, torque = np.zeros(1, ALIGNMENT)[0], _torque()
     a["angle"][0] = 1.0
-    pair = (_filtered(torque, cycles), torque) if cycles > 0.0 else (torque, _filtered(torque, -cycles))
+    pair = (brake.filtered(torque, cycles), torque) if cycles > 0.0 else (torque, brake.filtered(torque, -cycles))
     for shown, needed in zip(*pair, strict=True):
         compare(a, shown, needed, 0.0, 0.1 * _NOISE)
     assert a["informative"] > 15.0 and a["lag_left"] == 0.0
@@ -186,7 +177,7 @@ _CURRENT, _MOTION = ("current_q",), ("angle", "speed")
 
 
 @pytest.mark.parametrize("names", [_CURRENT, _MOTION])
-@pytest.mark.parametrize(("by", "cycles"), [(_late, 1.0), (_late, 2.0), (_filtered, 1.5), (_filtered, 2.0)])
+@pytest.mark.parametrize(("by", "cycles"), [(_late, 1.0), (_late, 2.0), (brake.filtered, 1.5), (brake.filtered, 2.0)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_it_is_undone_within_a_stop(names, by, cycles, seed):
     """The force is that of the sample, not of the time to which the earlier of both was moved back."""
@@ -203,7 +194,7 @@ def test_friction_does_not_go_through_a_filter_of_the_motion(parameters, seed):
     """It turns over with the motion that is left. Counted with the rest it hides a filter of 16 ms, and 3 to 4 kN remain."""
     samples, force = city.drive(seed, 40.0)
     samples, state = samples.copy(), new_state()
-    _moved(_MOTION, 4.0, _filtered)(samples)
+    _moved(_MOTION, 4.0, brake.filtered)(samples)
     error = (estimate(samples, parameters, state)["force"] - force)[-2500:]
     assert -5.5 < state[0]["alignment"]["lag"] < -3.5 and np.sqrt(np.mean(error**2)) < 100.0
 
@@ -299,11 +290,11 @@ def test_a_filter_and_its_inverse(cycles):
     true = _torque()
     a, m, undone = np.zeros(1, ALIGNMENT)[0], np.zeros(1, SAMPLE)[0], []
     a["lag"] = cycles
-    for value in _filtered(true, cycles) if cycles > 0.0 else true:
+    for value in brake.filtered(true, cycles) if cycles > 0.0 else true:
         m["dt"], m["current_q"] = _DT, value
         align(a, m)
         undone.append(float(m["current_q"]))
-    np.testing.assert_allclose(undone[2:], (true if cycles > 0.0 else _filtered(true, -cycles))[2:], atol=1e-9)
+    np.testing.assert_allclose(undone[2:], (true if cycles > 0.0 else brake.filtered(true, -cycles))[2:], atol=1e-9)
     m["dt"], m["current_q"] = 20.0 * abs(cycles) * _DT, 1.0
     align(a, m)
     assert m["current_q"] == pytest.approx(1.0, abs=0.06)
@@ -333,7 +324,7 @@ def test_a_force_beyond_the_range_is_told_at_its_own_sample(parameters, late):
 
 @pytest.mark.parametrize(
     ("by", "cycles", "field", "beyond"),
-    [(_late, 2.0, "delay", 5.0), (_filtered, 3.0, "lag", 12.5), (_filtered, 3.0, "lag", -12.5)],
+    [(_late, 2.0, "delay", 5.0), (brake.filtered, 3.0, "lag", 12.5), (brake.filtered, 3.0, "lag", -12.5)],
 )
 def test_it_survives_a_restart(parameters, by, cycles, field, beyond):
     p, resumed, snapshot = parameters[0], new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]

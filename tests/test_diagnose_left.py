@@ -137,8 +137,8 @@ def test_a_second_cause_is_no_shadow_of_the_largest():
     """A shadow says nothing beside a smooth function of what it is a shadow of; what follows something else keeps its gain."""
     rng, count, length = np.random.default_rng(4), 40, 60
     heat, speed = rng.uniform(0.0, 1.0, count * length), rng.uniform(-1.0, 1.0, count * length)
-    own, shadow = speed, (heat > 0.9).astype(float)
-    left = 800.0 * heat**2 + 400.0 * own + rng.normal(0.0, 50.0, count * length)
+    shadow = (heat > 0.9).astype(float)
+    left = 800.0 * heat**2 + 400.0 * speed + rng.normal(0.0, 50.0, count * length)
     episode = np.repeat(np.arange(count), length)
     bench = SimpleNamespace(episode={"torque": episode}, episodes=count, shows_turning=lambda channel: False)
     model = Model(bench, {}, {"torque": left}, [])
@@ -146,7 +146,7 @@ def test_a_second_cause_is_no_shadow_of_the_largest():
     screening.signals = {"caliper_temperature": heat, "clamp_force": np.full(count * length, 1.0)}
     screening._size = {"torque": 1e3}
     reasons = []
-    for column in (own, shadow):
+    for column in (speed, shadow):
         evidence = model.evidence("torque", [column])
         own = Coordinate("effects.any", "torque", 0.0, 1.0, np.inf, ())
         found = Candidate(EFFECT, "torque", (own,), (), (column,), evidence, gain=model.rms(evidence.gain, "torque"))

@@ -37,11 +37,6 @@ def _known(s):
     return [*(float(s[name]) for name in ("contact_angle", "scale", "growth", "jumps")), *s["creep"], s["error"][VISCOUS]]
 
 
-def _filter(values, cycles):
-    for row in range(1, len(values)):
-        values[row] = values[row - 1] + (values[row] - values[row - 1]) / (1.0 + cycles)
-
-
 @pytest.mark.parametrize("cycles", [2.0, 5.0])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_filter_that_the_current_comes_through_while_driving_leaves_nothing_behind(parameters, seed, cycles):
@@ -50,7 +45,7 @@ def test_a_filter_that_the_current_comes_through_while_driving_leaves_nothing_be
     plain, samples = estimate(samples, parameters), samples.copy()
     half = len(samples) // 2
     state = new_state()
-    _filter(samples["current_q"][half:], cycles)
+    samples["current_q"][half:] = brake.filtered(samples["current_q"][half:], cycles)
     later = slice(len(samples) - 2500, None)
     error = (estimate(samples, parameters, state)["force"] - force)[later]
     assert state[0]["alignment"]["lag"] > 1.0 and state[0]["scale"] == pytest.approx(1.0, abs=0.005)
@@ -61,7 +56,11 @@ def test_a_filter_that_the_current_comes_through_while_driving_leaves_nothing_be
 def test_nor_does_one_that_the_speed_comes_through(seed):
     """Eight milliseconds left 106 and 185 N."""
     half = len(city.drive(seed, 80.0)[0]) // 2
-    estimates, force = city.changed(lambda rows: _filter(rows["speed"][half:], 2.0), seed, 80.0)
+
+    def change(rows):
+        rows["speed"][half:] = brake.filtered(rows["speed"][half:], 2.0)
+
+    estimates, force = city.changed(change, seed, 80.0)
     assert np.sqrt(np.mean((estimates["force"] - force)[half + 1000 :] ** 2)) < 100.0
 
 
@@ -71,13 +70,13 @@ def test_what_was_known_some_stops_ago_is_known_again(parameters, s):
         _learn(s, float(by))
         keep(s)
     s["alternatives"]["log_odds"] = 50.0
-    go_back(s, brake.ideal(parameters), 10.0)
+    go_back(s, brake.ideal(parameters))
     assert _known(s) == pytest.approx(known)
     assert s["error"][[CONTACT, SCALE, *CREEPS]] == pytest.approx(0.0) and s["covariance"][VISCOUS, VISCOUS] == variance
     # Nothing is suspected, and what was learned meanwhile is not gone back to.
     assert np.all(s["alternatives"]["log_odds"][[STIFFNESS_JUMP, TORQUE_JUMP]] <= PRIOR_ODDS)
     _learn(s, 1.0)
-    go_back(s, brake.ideal(parameters), 10.0)
+    go_back(s, brake.ideal(parameters))
     assert _known(s) == pytest.approx(known)
 
 
@@ -99,14 +98,14 @@ def test_no_more_stops_are_gone_back_than_a_fault_takes_to_be_found(parameters, 
     for by in range(STOPS):
         keep(s)
         _learn(s, 1.0 + by)
-    go_back(s, brake.ideal(parameters), 0.0)
+    go_back(s, brake.ideal(parameters))
     assert _known(s) == pytest.approx(known)
 
 
 def test_what_the_clearance_shows_of_the_offset_is_kept(parameters, s):
     """It does not change quickly, so that neither a delay nor a filter matters."""
     s["error"][OFFSET], s["covariance"][OFFSET, OFFSET] = 0.3, 0.01**2
-    go_back(s, brake.ideal(parameters), 0.0)
+    go_back(s, brake.ideal(parameters))
     assert s["error"][OFFSET] == 0.3 and s["covariance"][OFFSET, OFFSET] == 0.01**2
     assert np.all(np.linalg.eigvalsh(s["covariance"]) > -1e-12)
 
@@ -115,5 +114,5 @@ def test_a_zero_that_moves_moves_what_is_gone_back_to(parameters, s):
     contact = float(s["contact_angle"])
     shift_zero(s, 2.0)
     _learn(s, 1.0)
-    go_back(s, brake.ideal(parameters), 0.0)
+    go_back(s, brake.ideal(parameters))
     assert s["contact_angle"] == pytest.approx(contact + 2.0)

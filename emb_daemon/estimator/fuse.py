@@ -32,6 +32,7 @@ from emb_daemon.estimator.hypotheses import (
     weigh,
 )
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, crept, disc_warmth
+from emb_daemon.estimator.rewind import keep
 from emb_daemon.estimator.status import (
     ANGLE_LATE,
     CONTACT_LOST,
@@ -312,6 +313,7 @@ def fuse(
         if s.stops > stops:
             weigh_common(s, p)
             attribute_straying(s)
+            keep(s)
         elif trusted and s.contact.engaged:
             follow_common(s, p, m.dt)
     else:

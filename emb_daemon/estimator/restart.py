@@ -172,17 +172,15 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
 def follow_heat(s: Record, t: Record, m: Record) -> None:
     """Simulate the heat flow of the time since the snapshot, with the plates' present temperatures."""
     ambient = m.ambient if m.has_status else m.caliper
-    if s.rested_s > 0.0:
-        before = s.disc
-        s.disc = heat_step(
-            t, s.pads, s.disc, m.inner_backplate, m.outer_backplate, ambient, 0.0, False, 0.0, s.rested_s, s.work, _STEP_S,
-            UNALTERED,
-        )  # fmt: skip
-        # Cooling air and braking meanwhile are unknown; both effects vanish as the disc cools.
-        s.temperature_sigma = min(s.temperature_sigma, _UNSEEN_K) * exp(-s.rested_s * t.disc_cooling / t.disc_heat_capacity)
-        s.temperature_sigma += 0.3 * abs(before - s.disc)
-        forgotten = exp(-s.rested_s / t.history_time)
-        rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
-        s.history = forgotten * s.history + (1.0 - forgotten) * rise
-        s.history_sigma *= forgotten
-        s.rested_s = 0.0
+    before = s.disc
+    s.disc = heat_step(
+        t, s.pads, s.disc, m.inner_backplate, m.outer_backplate, ambient, 0.0, False, 0.0, s.rested_s, s.work, _STEP_S,
+        UNALTERED,
+    )  # fmt: skip
+    # Cooling air and braking meanwhile are unknown; both effects vanish as the disc cools.
+    s.temperature_sigma = min(s.temperature_sigma, _UNSEEN_K) * exp(-s.rested_s * t.disc_cooling / t.disc_heat_capacity)
+    s.temperature_sigma += 0.3 * abs(before - s.disc)
+    forgotten = exp(-s.rested_s / t.history_time)
+    rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    s.history = forgotten * s.history + (1.0 - forgotten) * rise
+    s.history_sigma *= forgotten

@@ -1,13 +1,14 @@
 """Going back to what was known some stops ago, when a fault of the signals is found that may have been there since.
 
 A current or an angle that comes late, or through a filter, is found after a few strokes, and undone. What these strokes have
-taught of contact, pads, motor and friction was wrong: a current that is filtered by 5 ms has passed for pads half as stiff
-again.
+taught of contact, pads, motor and friction was wrong: a current that is filtered by 8 ms has passed for pads a quarter
+stiffer (tests/test_rewind.py).
 """
 
 import numpy as np
 
 from emb_daemon.estimator.hypotheses import fold, open_all
+from emb_daemon.estimator.paths import disc_warmth
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.fusion import CONTACT, CREEPS, GROWTH, OFFSET, SCALE, STATES, copy_errors
 
@@ -54,7 +55,7 @@ def keep(s: Record) -> None:
 
 
 @njit
-def go_back(s: Record, p: Record, warmth: float) -> None:
+def go_back(s: Record, p: Record) -> None:
     """Know what was known some stops ago, and suspect nothing."""
     a = s.learned[0]
     # Neither a delay nor a filter changes what the clearance shows of the offset.
@@ -67,7 +68,7 @@ def go_back(s: Record, p: Record, warmth: float) -> None:
     s.error[GROWTH] = a.growth - s.growth
     for i in range(len(CREEPS)):
         s.error[CREEPS[i]] = a.creep[i] - s.creep[i]
-    fold(s, warmth, True)
+    fold(s, disc_warmth(s), True)
     s.jumps, s.contact_walk, s.contact_age_s = a.jumps, a.contact_walk, 0.0
     keep_all(s)
     open_all(s, p)

@@ -16,8 +16,8 @@ from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
-from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, disc_warmth, doubt_memory, stiffness_path, torque_path
-from emb_daemon.estimator.rewind import go_back, keep, keep_all
+from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
+from emb_daemon.estimator.rewind import go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
@@ -49,7 +49,7 @@ from emb_daemon.estimator.unknown import (
     softening_sigma,
 )
 from emb_daemon.jit import Record, hypot, njit
-from emb_daemon.models.alignment import align, aligned, out_of_step
+from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.lateness import find_filter, follow, interrupt, speed_then, stand, unfilter, way_beside
@@ -120,7 +120,7 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
     angle, speed, current = m.angle, m.speed, m.current_q
     unfilter(s.lateness, m)
     if align(s.alignment, m) and p.clearance_sigma > 0.0:
-        go_back(s, p, disc_warmth(s))
+        go_back(s, p)
     _advance(s, p, m, angle, speed, out)
     m.angle, m.speed, m.current_q = angle, speed, current
 
@@ -176,10 +176,7 @@ def _advance(s, p, m, angle, speed, out):
     # Over a gap the current of its last cycle does not belong to the mean acceleration.
     if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown and aligned(s.alignment):
         watch_contact(s, p, m, force_before, torque, leverage)
-    stops = s.stops
     turning_sigma, standing_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
-    if s.stops > stops and not out_of_step(s.alignment):
-        keep(s)
     out.stiffness_force = s.force
     # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
     out.torque_force, out.ml_force = np.nan, s.force
@@ -227,7 +224,7 @@ def _follow_age(s, p, m, turned, moved_zero):
     # The way so far was beside another speed, and what it told of the brake is wrong.
     s.strayed, s.plausibility.apart = np.nan, 0.0
     leave_stretch(s.wander)
-    go_back(s, p, disc_warmth(s))
+    go_back(s, p)
     return True
 
 
