@@ -270,6 +270,14 @@ def draw_sized(
     raise RuntimeError(f"no effect of {size:g} N or K RMS in {_DRAWS} draws is physical")
 
 
+def _sizing_bench(frames: np.ndarray, start: Calibration) -> Bench:
+    """What sizes are measured on: all samples, whatever of them the diagnosis judges, so that a seed stays the same brake."""
+    bench = Bench([log_of(frames)], start)
+    for trial in bench.trials:
+        trial.yields[:] = False
+    return bench
+
+
 def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, size: float, seed: int) -> dict | None:
     """A drawn effect scaled until it adds ``size`` (N or K RMS), in quadrature, to its path's residual; none where that takes
     more than its port may bear, or no scale leads there."""
@@ -282,7 +290,7 @@ def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, s
         plant = base.copy()
         _put(plant, {name: values | {"size": tried}})
         frames, truth = simulate_log(plant, schedule, seed=seed)
-        return rmse(Bench([log_of(frames)], start).residuals({})[channel]), truth[:, 0]
+        return rmse(_sizing_bench(frames, start).residuals({})[channel]), truth[:, 0]
 
     floor, _ = simulated(0.0)
     tried = {"drawn_thickness": 10.0, "drawn_disc_heat": 100.0}.get(name, 0.05)
@@ -349,7 +357,7 @@ def _draw_hidden(
     hidden: dict[str, dict[str, float]] = {}
     if names:
         frames, _ = simulate_log(base, schedule, seed=seed)
-        bench = Bench([log_of(frames)], start)
+        bench = _sizing_bench(frames, start)
         for name in names:
             values = draw(name, rng)
             # Twice, because the effect is not quite linear in its size.

@@ -14,6 +14,7 @@ from emb_daemon.wire.contract import CYCLE_S
 from studies import blind
 from studies.blind import run_trial
 from studies.drives import rig_drag
+from studies.strangers import draw_stranger
 
 
 @pytest.mark.trial
@@ -119,6 +120,11 @@ def test_a_drawn_effect_that_no_brake_can_have_is_drawn_again(calibration, monke
     monkeypatch.setattr(blind, "sized", lambda *arguments: asked.append(sized(*arguments)) or asked[-1])
     drawn = blind.draw_sized(plant, schedule, calibration, np.random.default_rng(0), 150.0, seed=5)
     assert asked == [None, None, drawn] and 0.0 < drawn["drawn_stiffness"]["size"] < 0.5
+
+
+def test_a_seed_stays_the_same_brake():
+    """Campaigns and calibrations that were kept are of it, whatever of its samples the diagnosis judges since."""
+    assert draw_stranger(94).effects["drawn_torque_constant"]["size"] == pytest.approx(0.64697, abs=1e-5)
 
 
 def test_what_a_drawn_effect_adds_is_what_the_plant_says(calibration):

@@ -15,6 +15,7 @@ from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.restart import SNAPSHOT_S
+from emb_daemon.estimator.rewind import keep_all
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.jit import Array, Record, Records, entry, hypot, njit, sq
 from emb_daemon.models.fusion import CONTACT, FADE, FAST, GAIN, HOUSING, INERTIA, OF_THE_MODEL, OFFSET, SCALE
@@ -220,6 +221,8 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
         open_all(s, learned)
         forget_common(s)
     weigh_common(s, learned)
+    # What was known before is of a brake with other parameters.
+    keep_all(s)
 
 
 @njit

@@ -7,6 +7,7 @@ import numpy as np
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, doubt_memory, rest, shift_zero, turned
+from emb_daemon.estimator.rewind import keep_all
 from emb_daemon.estimator.unknown import offset_walk
 from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.contact import (
@@ -255,6 +256,8 @@ def place_contact(s: Record, p: Record, released: float) -> None:
     start_anew(s.contact)
     s.contact.lost = False
     open_again(s, p)
+    # Whatever was believed before it.
+    keep_all(s)
 
 
 @njit
