@@ -184,9 +184,10 @@ def _partial_correlation(trials: Sequence[Trial]) -> float:
     rest = table[:, 4:] - table[:, :4] @ np.linalg.lstsq(table[:, :4], table[:, 4:], rcond=None)[0]
     products = rest.T @ rest
     size = products[0, 0] * products[1, 1]
-    # Half of the mean square of a change is the variance of what changes at once.
+    # Half of the mean square of a change is the variance of what changes at once: of the load its own and the current's share.
     current_share, load_share = 0.5 * np.mean(change**2, axis=0) / np.var(table[:, 4:], axis=0)
-    kept = 1.0 - np.clip(load_share - current_share, 0.0, 1.0)
+    own_share = (load_share - current_share) / (1.0 - current_share) if current_share < 1.0 else 0.0
+    kept = 1.0 - np.clip(own_share, 0.0, 1.0)
     return min(float(products[0, 1] ** 2 / (size * kept)), 1.0) if size * kept > 0.0 else 0.0
 
 
@@ -283,11 +284,11 @@ class Bench:
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
         self.load_follows: bool = self.has_reference and not self.clamps and _partial_correlation(self.trials) > _FOR_THE_LOAD
-        if not self.clamps and not self.load_follows:
-            for trial in self.trials:
-                trial.log = replace(trial.log, samples=denoised(trial.log.samples))
         #: Whether the load is known to be nothing: then the current itself is all that is explained.
         self.turns_free: bool = self.has_reference and not self.clamps and not np.any(self.load_N)
+        if not self.clamps and not self.load_follows:
+            for trial in self.trials:
+                trial.log = replace(trial.log, samples=denoised(trial.log.samples, self.turns_free))
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere: float = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
 
