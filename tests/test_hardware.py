@@ -355,8 +355,8 @@ def test_a_free_motor_s_speed_is_smoothed_as_far_as_its_current_needs(noise_rad_
     assert denoised(samples, turns_free=False) is samples
     smooth = denoised(samples, turns_free=True)
     if noise_rad_per_s:
-        left, was = (np.std(np.diff(rows["speed"] - speed)) for rows in (smooth, samples))
-        assert left < 0.2 * was
+        left_A, was_A = (1e-3 * np.std(np.diff(rows["speed"] - speed)) / 0.004 for rows in (smooth, samples))
+        assert left_A < 0.01 < 0.3 * was_A
     else:
         assert smooth is samples
 
