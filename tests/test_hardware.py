@@ -166,13 +166,30 @@ def test_what_the_machine_takes_for_its_own_motion_is_no_current_for_the_load(ow
     moved_by = moved_by / moved_by.std()
 
     def explained(current, load):
-        samples = {"speed": speed, "current_q": current, "has_current": np.ones(len(current), bool)}
+        told = np.ones(len(current), bool)
+        samples = {"speed": speed, "current_q": current, "has_current": told, "dt": np.full(len(current), 0.004)}
         return residuals._partial_correlation([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
 
     current, load = (moved_by + 0.1 * random.normal(size=len(speed)) for _ in range(2))
     assert explained(current, load) < 0.01
     assert explained(current, moved_by + 3.0 * current) > 0.99
     assert explained(np.full(len(speed), 1.3), load) == 0.0
+
+
+def test_what_a_load_changes_by_at_once_is_no_work_of_a_current_that_does_not():
+    """A motor that is held by its current against another that jerks: by all of the load's scatter the current would seem not
+    to be there for it, and a constant fitted to the current would be half as large again. What scatters slowly does count."""
+    random = np.random.default_rng(2)
+    speed, current = np.sin(0.01 * np.arange(6000)), np.repeat(random.normal(size=60), 100)
+
+    def explained(load):
+        told = np.ones(len(speed), bool)
+        samples = {"speed": speed, "current_q": current, "has_current": told, "dt": np.full(len(speed), 0.004)}
+        return residuals._partial_correlation([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
+
+    scatter = 1.3 * random.normal(size=len(speed))
+    assert explained(current + scatter) > 0.9
+    assert explained(current + 1.3 * np.repeat(random.normal(size=60), 100)) < 0.5
 
 
 def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measured():
@@ -313,7 +330,7 @@ def test_the_inertia_of_a_slow_joint_is_not_diluted_by_the_steps_of_its_speed(mo
 
     found = diagnose([log], stated)
     assert inertia(found) == pytest.approx(0.05, rel=0.1)
-    monkeypatch.setattr(residuals, "denoised", lambda samples: samples)
+    monkeypatch.setattr(residuals, "denoised", lambda samples, turns_free: samples)
     assert inertia(diagnose([log], stated)) < 0.04
 
 
@@ -323,7 +340,25 @@ def test_a_speed_without_noise_stays_as_it_is(ripple_Hz):
     time_s = 0.004 * np.arange(3000)
     speed = 30.0 * np.sin(2.0 * np.pi * time_s / 0.5) if not ripple_Hz else 5.0 + np.sin(2.0 * np.pi * ripple_Hz * time_s)
     samples = _drawn(time_s, np.cumsum(speed) * 0.004, speed, 0.0 * time_s + 1.0).samples
-    assert denoised(samples) is samples
+    assert denoised(samples, turns_free=False) is samples
+
+
+@pytest.mark.parametrize("noise_rad_per_s", [0.0, 0.1])
+def test_a_free_motor_s_speed_is_smoothed_as_far_as_its_current_needs(noise_rad_per_s):
+    """Thrown to and fro it changes by much more than the noise, which is still most of what is left of the current; and
+    where nothing but the current's own noise is left, no smoothing is worth its loss."""
+    random, time_s = np.random.default_rng(3), 0.004 * np.arange(6000)
+    speed = 30.0 * np.sin(2.0 * np.pi * time_s / 0.8)
+    current = 1e-3 * np.gradient(speed, time_s) + 0.2 * np.sign(speed) + 0.01 * random.normal(size=len(time_s))
+    noisy = speed + noise_rad_per_s * random.normal(size=len(time_s))
+    samples = _drawn(time_s, np.cumsum(speed) * 0.004, noisy, current).samples
+    assert denoised(samples, turns_free=False) is samples
+    smooth = denoised(samples, turns_free=True)
+    if noise_rad_per_s:
+        left_A, was_A = (1e-3 * np.std(np.diff(rows["speed"] - speed)) / 0.004 for rows in (smooth, samples))
+        assert left_A < 0.01 < 0.3 * was_A
+    else:
+        assert smooth is samples
 
 
 def test_saturation_takes_half_of_the_constant_at_most_at_the_largest_current_of_the_logs():

@@ -49,6 +49,8 @@ _BRAKING_NM = 20.0
 #: Below it most of the current turns the machine itself, and a constant fitted to the load would be less than half of the
 #: motor's (regression dilution).
 _FOR_THE_LOAD = 0.5
+#: Time over which what a load changes by more than the current is none of its work: strokes and holds last longer, s.
+_AT_ONCE_S = 0.05
 #: Share of the sliding friction from which it has turned over after a reversal.
 _TURNED_OVER = 0.9
 #: Effect and amplitude of what changes the torque constant by the current of its own sample.
@@ -161,8 +163,11 @@ def _temperatures(log: Log) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _partial_correlation(trials: Sequence[Trial]) -> float:
-    """Squared partial correlation of current and reference load, beside the motor's direction, speed and acceleration."""
-    tables = []
+    """Squared partial correlation of current and reference load, beside the motor's direction, speed and acceleration.
+
+    What the load changes by at once, and the current does not, cannot be the current's work, and is left out: where a jerking
+    motor loads one that is held by its current, a constant fitted to the current would be too large by that share."""
+    tables, changes = [], []
     for trial in trials:
         samples = trial.log.samples
         speed, current = samples["speed"], samples["current_q"]
@@ -171,13 +176,19 @@ def _partial_correlation(trials: Sequence[Trial]) -> float:
             [np.ones(len(speed)), np.sign(speed), speed, np.diff(speed, prepend=speed[:1]), current, trial.force_N]
         )
         tables.append(own[known])
-    table = np.concatenate(tables)
-    if len(table) < table.shape[1] or not np.ptp(table[:, 4]) or not np.ptp(table[:, 5]):
+        apart = max(round(_AT_ONCE_S / max(float(np.median(samples["dt"])), CYCLE_S)), 1)
+        changes.append(own[known][apart:, 4:] - own[known][:-apart, 4:])
+    table, change = np.concatenate(tables), np.concatenate(changes)
+    if len(table) < table.shape[1] or not len(change) or not np.ptp(table[:, 4]) or not np.ptp(table[:, 5]):
         return 0.0
     rest = table[:, 4:] - table[:, :4] @ np.linalg.lstsq(table[:, :4], table[:, 4:], rcond=None)[0]
     products = rest.T @ rest
     size = products[0, 0] * products[1, 1]
-    return float(products[0, 1] ** 2 / size) if size > 0.0 else 0.0
+    # Half of the mean square of a change is the variance of what changes at once: of the load its own and the current's share.
+    current_share, load_share = 0.5 * np.mean(change**2, axis=0) / np.var(table[:, 4:], axis=0)
+    own_share = (load_share - current_share) / (1.0 - current_share) if current_share < 1.0 else 0.0
+    kept = 1.0 - np.clip(own_share, 0.0, 1.0)
+    return min(float(products[0, 1] ** 2 / (size * kept)), 1.0) if size * kept > 0.0 else 0.0
 
 
 def _current_late_s(trial: Trial) -> float:
@@ -273,11 +284,11 @@ class Bench:
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
         self.load_follows: bool = self.has_reference and not self.clamps and _partial_correlation(self.trials) > _FOR_THE_LOAD
-        if not self.clamps and not self.load_follows:
-            for trial in self.trials:
-                trial.log = replace(trial.log, samples=denoised(trial.log.samples))
         #: Whether the load is known to be nothing: then the current itself is all that is explained.
         self.turns_free: bool = self.has_reference and not self.clamps and not np.any(self.load_N)
+        if not self.clamps and not self.load_follows:
+            for trial in self.trials:
+                trial.log = replace(trial.log, samples=denoised(trial.log.samples, self.turns_free))
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere: float = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
 
