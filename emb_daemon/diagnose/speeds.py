@@ -91,4 +91,4 @@ def _left_of_current(samples: np.ndarray, moving: np.ndarray) -> float:
     mean, change = 0.5 * (speed[1:] + speed[:-1])[rows], np.diff(speed)[rows] / samples["dt"][1:][rows]
     table = np.column_stack([change, np.sign(mean), mean, np.ones(len(rows))])
     current = samples["current_q"][1:][rows]
-    return float(np.std(current - table @ np.linalg.lstsq(table, current)[0]))
+    return float(np.std(current - table @ np.linalg.lstsq(table, current, rcond=None)[0]))
