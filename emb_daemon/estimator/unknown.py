@@ -81,8 +81,8 @@ _CONTACT_REACH_M, _SCALE_REACH, _CREEP_REACH, _GAIN_REACH = 100e-6, 0.3, 0.1, 0.
 #: full speed over its Coulomb torque: half of what the thickest of those greases makes of the thinnest's.
 INERTIA_REACH, _VISCOUS_REACH = 0.1, 2.0
 #: Standard deviations of how far a brake can be from its calibration beyond which it is not: what motor and friction then seem
-#: to be is something else, which no hypothesis contains. Usable samples beyond three sigma, summed over 422 phases with faults of
-#: sensors and bus (`studies.silent injected --count 3 --seed 9`, rig A and service nominal): 52 % with this bound, 66 % without.
+#: to be is something else, which no hypothesis contains. Usable samples beyond three sigma, summed over 422 phases with
+#: faults of sensors and bus (`studies.silent injected --count 3 --seed 9`, rig A, service nominal): 52 % with, 66 % without.
 _IMPOSSIBLE = 3.0
 #: A brake that is not its calibration's to the micrometre and does not hold still: contact angle, m, and how it walks while
 #: the disc turns (run-out, wear and growth move pads by tens of micrometres within minutes) and, slower by the factor, while
