@@ -157,6 +157,13 @@ def test_an_offset_shows_where_a_motor_turns_one_way_and_friction_cannot_be_less
     assert found.after.rmse("torque") < 1.3 * 20.0 < 0.1 * found.before.rmse("torque")
 
 
+def _explained(speed, current, load):
+    """How much of a load the current is there for."""
+    told = np.ones(len(speed), bool)
+    samples = {"speed": speed, "current_q": current, "has_current": told, "dt": np.full(len(speed), 0.004)}
+    return residuals._partial_correlation([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
+
+
 @pytest.mark.parametrize("own", ["direction", "speed", "acceleration"])
 def test_what_the_machine_takes_for_its_own_motion_is_no_current_for_the_load(own):
     """Though the load may follow the same: that of a mass does the acceleration."""
@@ -164,16 +171,10 @@ def test_what_the_machine_takes_for_its_own_motion_is_no_current_for_the_load(ow
     speed = np.convolve(random.normal(size=3000), np.ones(20), "same")
     moved_by = {"direction": np.sign(speed), "speed": speed, "acceleration": np.diff(speed, prepend=speed[:1])}[own]
     moved_by = moved_by / moved_by.std()
-
-    def explained(current, load):
-        told = np.ones(len(current), bool)
-        samples = {"speed": speed, "current_q": current, "has_current": told, "dt": np.full(len(current), 0.004)}
-        return residuals._partial_correlation([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
-
     current, load = (moved_by + 0.1 * random.normal(size=len(speed)) for _ in range(2))
-    assert explained(current, load) < 0.01
-    assert explained(current, moved_by + 3.0 * current) > 0.99
-    assert explained(np.full(len(speed), 1.3), load) == 0.0
+    assert _explained(speed, current, load) < 0.01
+    assert _explained(speed, current, moved_by + 3.0 * current) > 0.99
+    assert _explained(speed, np.full(len(speed), 1.3), load) == 0.0
 
 
 def test_what_a_load_changes_by_at_once_is_no_work_of_a_current_that_does_not():
@@ -181,15 +182,8 @@ def test_what_a_load_changes_by_at_once_is_no_work_of_a_current_that_does_not():
     to be there for it, and a constant fitted to the current would be half as large again. What scatters slowly does count."""
     random = np.random.default_rng(2)
     speed, current = np.sin(0.01 * np.arange(6000)), np.repeat(random.normal(size=60), 100)
-
-    def explained(load):
-        told = np.ones(len(speed), bool)
-        samples = {"speed": speed, "current_q": current, "has_current": told, "dt": np.full(len(speed), 0.004)}
-        return residuals._partial_correlation([SimpleNamespace(log=SimpleNamespace(samples=samples), force_N=load)])
-
-    scatter = 1.3 * random.normal(size=len(speed))
-    assert explained(current + scatter) > 0.9
-    assert explained(current + 1.3 * np.repeat(random.normal(size=60), 100)) < 0.5
+    assert _explained(speed, current, current + 1.3 * random.normal(size=len(speed))) > 0.9
+    assert _explained(speed, current, current + 1.3 * np.repeat(random.normal(size=60), 100)) < 0.5
 
 
 def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measured():
@@ -359,6 +353,8 @@ def test_a_free_motor_s_speed_is_smoothed_as_far_as_its_current_needs(noise_rad_
         assert left_A < 0.01 < 0.3 * was_A
     else:
         assert smooth is samples
+    samples["has_current"] = False
+    assert denoised(samples, turns_free=True) is samples
 
 
 def test_saturation_takes_half_of_the_constant_at_most_at_the_largest_current_of_the_logs():

@@ -4,7 +4,9 @@ import brake
 import city
 import numpy as np
 import pytest
+from test_training_rules import applied
 
+from emb_daemon.estimator.contact import place_contact
 from emb_daemon.estimator.hypotheses import PRIOR_ODDS, STIFFNESS_JUMP, TORQUE_JUMP
 from emb_daemon.estimator.paths import shift_zero
 from emb_daemon.estimator.records import new_state
@@ -116,3 +118,35 @@ def test_a_zero_that_moves_moves_what_is_gone_back_to(parameters, s):
     _learn(s, 1.0)
     go_back(s, brake.ideal(parameters))
     assert s["contact_angle"] == pytest.approx(contact + 2.0)
+
+
+def test_the_force_goes_back_with_a_disc_that_is_warm(parameters, s):
+    """By the way that the contact moves back, and what the growth gone back to makes of the disc's warmth."""
+    s["temperature_known"], s["disc"], s["growth_start"] = True, 150.0, 30.0
+    contact, growth = float(s["contact_angle"]), float(s["growth"])
+    _learn(s, 1.0)
+    past_contact = float(s["past_contact"])
+    go_back(s, brake.ideal(parameters))
+    gained = s["past_contact"] - past_contact
+    assert s["growth"] == pytest.approx(growth)
+    assert gained == pytest.approx(-1e-4 * 120.0 + 0.5) and s["contact_angle"] == pytest.approx(contact)
+
+
+def test_a_contact_that_was_placed_anew_is_not_gone_back_from(parameters, s):
+    """The released position was seen since, whatever signals came late."""
+    p = brake.ideal(parameters)
+    place_contact(s, p, float(s["contact_angle"]) + 2.0)
+    placed = float(s["contact_angle"])
+    _learn(s, 1.0)
+    go_back(s, p)
+    assert s["contact_angle"] == pytest.approx(placed)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_training_is_not_gone_back_from(kept):
+    """What was known before is of a brake with another curve, and the contact of the stroke stays."""
+    _, trained, _, learned = applied(kept)
+    known = _known(trained)
+    _learn(trained, 1.0)
+    go_back(trained, learned)
+    assert _known(trained) == pytest.approx(known)

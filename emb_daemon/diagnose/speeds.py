@@ -34,21 +34,27 @@ def denoised(samples: np.ndarray, turns_free: bool) -> np.ndarray:
     moving = in_turn[1:] & (np.abs(samples["speed"][1:]) > STEP_RAD_PER_S)
     if np.sum(moving) < _FEWEST:
         return samples
-    window = _by_noise(samples["speed"], moving)
-    result = _smoothed(samples, in_turn, window)
+    window = _by_noise(samples["speed"], in_turn, moving)
+    result = _with_speed(samples, _smoothed(samples["speed"], in_turn, window)) if window else samples
     if not turns_free:
         return result
     left = _left_of_current(result, moving)
     for longer in (w for w in _WINDOWS if w > window):
-        tried = _smoothed(samples, in_turn, longer)
+        tried = _with_speed(samples, _smoothed(samples["speed"], in_turn, longer))
         less = _left_of_current(tried, moving)
-        if less > _LESS * left:
+        if not less < _LESS * left:
             break
         result, left = tried, less
     return result
 
 
-def _by_noise(speed: np.ndarray, moving: np.ndarray) -> int:
+def _with_speed(samples: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    result = samples.copy()
+    result["speed"] = speed
+    return result
+
+
+def _by_noise(speed: np.ndarray, in_turn: np.ndarray, moving: np.ndarray) -> int:
     """The window that the noise of the changes of speed asks for, by which those are ``moving``; 0 for none."""
     changes = np.where(moving, np.diff(speed), 0.0)
     square, first, second, *apart = (
@@ -63,22 +69,17 @@ def _by_noise(speed: np.ndarray, moving: np.ndarray) -> int:
         return 0
     for window in _WINDOWS:
         left = variance * float(np.sum(np.diff(savgol_coeffs(window, 2), prepend=0.0, append=0.0) ** 2))
-        if left <= _MOST * np.mean(np.diff(_filtered(speed, window))[moving] ** 2):
+        if left <= _MOST * np.mean(np.diff(_smoothed(speed, in_turn, window))[moving] ** 2):
             break
     return window
 
 
-def _filtered(speed: np.ndarray, window: int) -> np.ndarray:
-    return savgol_filter(speed, window, 2) if len(speed) >= window else speed
-
-
-def _smoothed(samples: np.ndarray, in_turn: np.ndarray, window: int) -> np.ndarray:
-    """The rows with their speeds smoothed, not across what ``in_turn`` says is missing."""
-    if not window:
-        return samples
-    result = samples.copy()
-    for first, last in pairwise([0, *np.flatnonzero(~in_turn[1:]) + 1, len(samples)]):
-        result["speed"][first:last] = _filtered(samples["speed"][first:last], window)
+def _smoothed(speed: np.ndarray, in_turn: np.ndarray, window: int) -> np.ndarray:
+    """Speeds smoothed over so many samples, not across what ``in_turn`` says is missing."""
+    result = speed.copy()
+    for first, last in pairwise([0, *np.flatnonzero(~in_turn[1:]) + 1, len(speed)]):
+        if last - first >= window:
+            result[first:last] = savgol_filter(speed[first:last], window, 2)
     return result
 
 
