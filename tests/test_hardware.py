@@ -186,6 +186,15 @@ def test_what_a_load_changes_by_at_once_is_no_work_of_a_current_that_does_not():
     assert _explained(speed, current, current + 1.3 * np.repeat(random.normal(size=60), 100)) < 0.5
 
 
+def test_of_a_load_that_swings_back_meanwhile_nothing_is_left_out():
+    """Ten times a second, and the current with it."""
+    random, time_s = np.random.default_rng(2), 0.004 * np.arange(6000)
+    swing, slow = np.sin(20.0 * np.pi * time_s), np.repeat(random.normal(size=60), 100)
+    current, load = 0.5 * swing + slow, 2.0 * swing + 0.5 * slow
+    expected = np.corrcoef(current, load)[0, 1] ** 2
+    assert _explained(np.sin(0.01 * np.arange(6000)), current, load) == pytest.approx(expected, abs=0.05) and expected > 0.3
+
+
 def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measured():
     """And where a measured load tells it."""
     priors = []
