@@ -26,6 +26,7 @@ from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.dataset import DIGEST, Drive, read_drive, write_drive
 from emb_daemon.fleet.ingest import Job, ingest
 from emb_daemon.fleet.replaying import replay_drive
+from emb_daemon.identify.text import rounded
 from emb_daemon.logs.candump import parse_candump
 from emb_daemon.logs.read import log_ending, read_file, read_frames, read_log, unpack
 from emb_daemon.logs.write import write_frames
@@ -200,8 +201,9 @@ def main() -> None:
         print(f"{stage.name:<24}{stage.microseconds_a_sample:>11.2f}{stage.times_real_time:>14.0f}")
     print(f"{'read from':<12}× real time   by python-can   ratio")
     for reading in readings(path):
-        ratio = reading.bulk / reading.one_by_one
-        print(f"{reading.ending:<12}{reading.bulk:>11.0f}{reading.one_by_one:>16.0f}{ratio:>8.0f}")
+        # Significant digits: of a log of seconds MF4 files are read no faster than their reader's process begins.
+        bulk, single, ratio = (rounded(x, 3) for x in (reading.bulk, reading.one_by_one, reading.bulk / reading.one_by_one))
+        print(f"{reading.ending:<12}{bulk:>11g}{single:>16g}{ratio:>8g}")
     print(f"{_FLEET_H} h a day take:")
     for name in ("replay from columns", "project on all causes"):
         print(f"{name:<24}{_FLEET_H / times[name]:.1f} core-hours; a core-second is {times[name] / 3600.0:.2f} h of driving")
