@@ -155,6 +155,33 @@ def test_friction_at_standstill_does_not_move_the_estimate_beyond_its_sigma(para
     assert np.all(error < 2.0 * estimates["sigma"][len(up) :])
 
 
+def _creeping_hold(p, wheel_speed):
+    """SAMPLE rows, force N: pads creep for half a minute and the motor follows. Friction stays where an uneven disc keeps it,
+    which lets the motor go back in each turn of the wheel by less than its angle tells."""
+    p["effects"] = np.zeros((), p["effects"].dtype)
+    p["thermal"]["softening"] = 0.0
+    up, count = brake.clamp(p, 12.0, 1.0), 2.0 * paths.FLICKER_RAD
+    angle = np.concatenate([up, up[-1] + count * np.floor(0.008 * 0.004 * np.arange(7500) / count)])
+    share = np.concatenate([np.ones(len(up)), np.linspace(1.0, 0.2, 500), np.full(7000, 0.2)])
+    rows, force = brake.samples(p, angle, friction=share)
+    rows["wheel_speed"] = wheel_speed
+    return brake.noisy(rows, p), force
+
+
+def test_a_motor_that_an_uneven_disc_turns_back_unseen_does_not_mislead(parameters):
+    """By its angle it creeps forwards, and all of the friction opposes it; a fifth of it does."""
+    rows, force = _creeping_hold(parameters[0], 37.0)
+    estimates = estimate(rows, parameters[0])
+    assert rmse((estimates["torque_force"] - force)[-2000:]) > 1000.0
+    assert rmse((estimates["force"] - force)[-2000:]) < 100.0
+
+
+def test_a_motor_that_creeps_beside_a_wheel_at_rest_turns_its_friction_over(parameters):
+    """No disc swings there, and what the torque says is heard."""
+    resting, turning = (estimate(_creeping_hold(parameters[0], speed)[0], parameters[0])[-2000:] for speed in (0.0, 37.0))
+    assert np.median(resting["torque_sigma"]) < 0.6 * np.median(turning["torque_sigma"])
+
+
 def _shares(travels, dt=0.004):
     """`turned_back` after each of the ways, rad."""
     shares, direction = [0.0], 0.0

@@ -1,6 +1,6 @@
 """Both force paths of one corner, and what acts on them: motor angle to force, motor torque to force."""
 
-from math import exp, sqrt
+from math import exp, pi, sqrt
 
 import numpy as np
 
@@ -10,7 +10,15 @@ from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
 from emb_daemon.models.lateness import friction_since, remember, turned_within
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
-from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, slid_angle, turned_back, unexplained_torque
+from emb_daemon.models.torque import (
+    NOISE_TURNS_BACK,
+    friction_state,
+    slid_angle,
+    turned_back,
+    turned_unseen,
+    unexplained_torque,
+)
+from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Time between two samples up to which none is missing, s.
@@ -26,6 +34,9 @@ _CERTAINLY = 3.0
 _SLID = 0.5
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
+#: Way (rad) that a motor which seems to stand, or to creep, may go to and fro for each rad of a wheel whose disc is uneven:
+#: there and back over a count in each turn.
+_UNSEEN_RAD = 4.0 * FLICKER_RAD / (2.0 * pi)
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
 _CREEP_S = (1.0, 8.0)
 #: A time after which everything has settled, s.
@@ -230,6 +241,9 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     s.friction_state, mean, s.friction_variance = friction_state(
         before, variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
+    if m.has_wheel_speed and m.wheel_speed > TURNING_RAD_PER_S and s.past_contact > 0.0:
+        unseen = _UNSEEN_RAD * m.wheel_speed * m.dt
+        s.friction_variance = turned_unseen(s.friction_variance, unseen, p.presliding_angle)
     if s.straying.creeps and slid != 0.0 and s.past_contact < 0.0:
         # Nor is it known whether an angle that moves while the speed, now and of late, shows nothing has slid it: nothing
         # drives the motor of an open brake, while that of a closed one follows pads and disc.

@@ -5,9 +5,9 @@ friction state that turns over within a presliding angle (Dahl, "A solid frictio
 friction is while the motor stands still.
 """
 
-from math import exp
+from math import exp, sqrt
 
-from emb_daemon.jit import njit
+from emb_daemon.jit import njit, sq
 
 #: Time constant over which reversals are counted, s: a dozen samples. One reversal adds 0.08 to the share.
 _OF_LATE_S = 0.05
@@ -53,6 +53,13 @@ def friction_state(
     after = direction + (state - direction) * decay
     mean = direction + (state - direction) * weight
     return after, mean, variance * decay * decay
+
+
+@njit
+def turned_unseen(variance: float, travel: float, presliding_angle: float) -> float:
+    """Variance of the friction state after the motor went to and fro over ``travel`` rad in all, less at a time than its angle
+    tells: it may have turned friction over meanwhile, or have stood."""
+    return sq(1.0 - (1.0 - sqrt(variance)) * exp(-travel / presliding_angle))
 
 
 @njit
