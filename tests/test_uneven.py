@@ -295,3 +295,14 @@ def test_only_a_motor_that_moves_on_a_turning_disc_teaches(p, what):
     before = s["uneven"]["amplitude"].copy()
     _take(s, p, m, 1200.0 * p["gear_gain"], trusted=what != "fault")
     assert np.any(s["uneven"]["amplitude"] != before) == (what == "nothing")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_the_way_of_the_force_over_a_turn_is_what_such_a_disc_makes(share):
+    u, angle = new_state()[0]["uneven"], np.linspace(0.0, 2.0 * np.pi, 10_001)
+    u["share"], u["force"] = share, (2e7, 0.0, 0.0, 2e7)
+    for order, cosine, sine in ((1, 8e-6, 0.0), (1, 3e-6, -4e-6), (2, -5e-6, 2e-6)):
+        u["amplitude"] = 0.0
+        u["amplitude"][2 * order - 2], u["amplitude"][2 * order - 1] = cosine, sine
+        shift = 2e7 * (cosine * np.cos(order * angle) + sine * np.sin(order * angle))
+        assert 2.0 * np.pi * uneven.way_per_rad(u) == pytest.approx(share * np.abs(np.diff(shift)).sum(), rel=1e-3)

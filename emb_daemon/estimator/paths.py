@@ -5,6 +5,7 @@ from math import exp, pi, sqrt
 import numpy as np
 
 from emb_daemon.effects import paths as effects
+from emb_daemon.estimator.uneven import way_per_rad
 from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
@@ -34,9 +35,6 @@ _CERTAINLY = 3.0
 _SLID = 0.5
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
-#: Way (rad) that a motor which seems to stand, or to creep, may go to and fro for each rad of a wheel whose disc is uneven:
-#: there and back over a count in each turn.
-_UNSEEN_RAD = 4.0 * FLICKER_RAD / (2.0 * pi)
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
 _CREEP_S = (1.0, 8.0)
 #: A time after which everything has settled, s.
@@ -77,6 +75,7 @@ def position(s: Record, p: Record, m: Record) -> float:
     s.travel = m.angle + s.ahead - before
     effects.look(e.terms, s, p, m)
     gained = effects.thickness(e, state, m, s.disc, s.temperature_known, s.power, m.dt)
+    s.swelled, s.gained = abs(gained - s.gained), gained
     grown = s.growth * disc_warmth(s)
     late = turned_within(s.lately, s.late)
     angle, s.gear_slope = turned(s, p, m.angle + late + effects.motor_angle(e, state, m, s.lately, m.dt))
@@ -225,6 +224,18 @@ def _slid(s, p, angle, travel, dt):
 
 
 @njit
+def _unseen(s, p, m):
+    """Way (rad) that a motor which seems to stand or to creep may have gone to and fro in this sample: as far as the gear's
+    friction yields to an uneven disc, but no further than there and back over a count in each turn of the wheel."""
+    friction = p.offset_friction + p.load_friction * s.force * s.gear_slope
+    if not m.has_wheel_speed or m.wheel_speed <= TURNING_RAD_PER_S or friction <= 0.0:
+        return 0.0
+    turned = m.wheel_speed * m.dt
+    swung = s.drive_slope * s.swelled + p.gear_gain * s.gear_slope * way_per_rad(s.uneven) * turned
+    return min(p.presliding_angle * swung / friction, 4.0 * FLICKER_RAD * turned / (2.0 * pi))
+
+
+@njit
 def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     """Torque path over the cycle that ends at this sample.
 
@@ -241,9 +252,8 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     s.friction_state, mean, s.friction_variance = friction_state(
         before, variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
-    if m.has_wheel_speed and m.wheel_speed > TURNING_RAD_PER_S and s.past_contact > 0.0:
-        unseen = _UNSEEN_RAD * m.wheel_speed * m.dt
-        s.friction_variance = turned_unseen(s.friction_variance, unseen, p.presliding_angle)
+    if s.past_contact > 0.0:
+        s.friction_variance = turned_unseen(s.friction_variance, _unseen(s, p, m), p.presliding_angle)
     if s.straying.creeps and slid != 0.0 and s.past_contact < 0.0:
         # Nor is it known whether an angle that moves while the speed, now and of late, shows nothing has slid it: nothing
         # drives the motor of an open brake, while that of a closed one follows pads and disc.

@@ -8,7 +8,7 @@ is part of its standard deviation.
 It learns only while the motor turns: a standing motor is held by friction, whatever the disc does to the force.
 """
 
-from math import cos, exp, sin, sqrt
+from math import cos, exp, pi, sin, sqrt
 
 import numpy as np
 
@@ -189,6 +189,15 @@ def force_sigma(u: Record) -> float:
         for j in range(STATES):
             variance += u.force[i] * u.covariance[i, j] * u.force[j]
     return sqrt(max(u.share * variance, 0.0))
+
+
+@njit
+def way_per_rad(u: Record) -> float:
+    """How far it lets the force go to and fro over a rad of the wheel, N/rad."""
+    total = 0.0
+    for k in range(0, STATES, 2):
+        total += (k // 2 + 1) * hypot(u.force[k], u.force[k + 1]) * hypot(u.amplitude[k], u.amplitude[k + 1])
+    return u.share * 2.0 / pi * total
 
 
 @njit

@@ -14,6 +14,8 @@ _OF_LATE_S = 0.05
 #: Share of samples with a reversal above which an angle's motion is noise. Noise of the angle reverses in two of three
 #: samples, a sum of noisy speeds in every other, a motor that swings at 10 Hz in one of twelve.
 NOISE_TURNS_BACK = 0.15
+#: Standard deviation of a friction that is anywhere between all and none.
+_BETWEEN = 1.0 / sqrt(3.0)
 
 
 @njit
@@ -57,9 +59,10 @@ def friction_state(
 
 @njit
 def turned_unseen(variance: float, travel: float, presliding_angle: float) -> float:
-    """Variance of the friction state after the motor went to and fro over ``travel`` rad in all, less at a time than its angle
-    tells: it may have turned friction over meanwhile, or have stood."""
-    return sq(1.0 - (1.0 - sqrt(variance)) * exp(-travel / presliding_angle))
+    """Variance of the friction state after the motor may have gone to and fro over ``travel`` rad in all, less at a time than
+    its angle tells: friction is then anywhere between what the angle says and none."""
+    sigma = sqrt(variance)
+    return sq(sigma + max(_BETWEEN - sigma, 0.0) * (1.0 - exp(-travel / presliding_angle)))
 
 
 @njit
