@@ -224,6 +224,7 @@ def prepare(names: tuple[str, ...], number: int, seed: int, brake: Brake, famili
     fault = _join([families[name](rng, moments, size) for name in names])
     if fault.effects:
         calibration, own = _with_effects(calibration, fault.effects), _with_effects(own, fault.effects)
+        effects = {name: values for name, values in effects.items() if name not in fault.effects}
     another = int(rng.integers(1 << 32))
     plant = plant_from_calibration(own, another if unit is None else unit, effects, fault.pads_mm)
     for name in ("current_noise", "speed_noise", "angle_noise", "temperature_noise"):

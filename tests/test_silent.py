@@ -16,7 +16,7 @@ from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
 from studies import unlisted
 from studies.faults import Size, alter, lose, size_of
-from studies.grid import FAMILIES, draw_drive, drive
+from studies.grid import FAMILIES, brake_of, draw_drive, drive, prepare
 from studies.phases import first_flag_s, judge
 from studies.silent import main
 
@@ -168,6 +168,14 @@ def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(mo
             time_s += 0.08
             for frame in fault.bus(frames.copy(), time_s):
                 assert crc(int(frame["can_id"]), frame["data"]) == int(frame["data"]) & 0xFF
+
+
+def test_a_brake_with_a_disc_of_its_own_has_the_one_that_its_calibration_is_given():
+    """Where the wheel's phase is the question, nothing may be wrong before the fault."""
+    uneven = {"disc_thickness_variation": {"order_1_sine_um": -15.0}}
+    _, _, calibration, car, _ = prepare(("wheel_pulses_pause",), 0, 1, brake_of(None)._replace(effects=uneven, unit=1))
+    for name, value in calibration.effects["disc_thickness_variation"].items():
+        assert car.plants["effects"]["disc_thickness_variation"][name] == pytest.approx(value, rel=0.2)
 
 
 def test_effects_from_no_catalogue_enter_at_every_port(plant, moments):
