@@ -164,6 +164,22 @@ def test_a_disc_that_turns_otherwise_than_the_campaign_says_is_left_out(rig, tmp
     assert "disc_turns_per_s: expected 2 turns per second" in fault
 
 
+def test_a_force_that_no_such_brake_reaches_is_left_out(rig, tmp_path):
+    """Of a brake that jammed, or in another unit; not that of a sensor with outliers."""
+    sheet = (rig / "datasheet.yaml").read_text()
+    (tmp_path / "datasheet.yaml").write_text(sheet)
+    (tmp_path / "campaign.yaml").write_text("rig: A\ndatasheet: datasheet.yaml\n")
+    name = f"{rig}/static/random_6p5mm.log.gz"
+    campaign = load_campaign(tmp_path / "campaign.yaml")
+    log = campaign.load(name, "random", "motion")
+    log.force_N[np.flatnonzero(np.isfinite(log.force_N))[:3]] = 1e6
+    assert campaign.load(name, "random", "motion") is log and not campaign.faults
+    log.force_N[:] *= 10.0
+    assert campaign.load(name, "random", "motion") is None
+    (fault,) = campaign.faults
+    assert re.search(r"random: .*random_6p5mm.log.gz: the reference force reaches \d+ kN, which no brake of 30 kN", fault)
+
+
 def test_a_wheel_with_other_pulses_than_the_daemon_counts_is_refused(rig, tmp_path):
     sheet = (rig / "datasheet.yaml").read_text()
     (tmp_path / "datasheet.yaml").write_text(sheet.replace("pulses_per_revolution: 96", "pulses_per_revolution: 48"))

@@ -25,6 +25,9 @@ NEED_INTEGRATED = "training and braking heat at full frame rate"
 #: A log has full frame rate with two seconds of samples that are no further apart than 1.025 cycles, s. Share of the rated
 #: force that a log must reach to identify a curve.
 _LEAST_SAMPLES, _LONGEST_CYCLE_S, _LEAST_FORCE = 500, 0.0041, 0.1
+#: Share of the rated force that no brake reaches: its motor or its screw ends before. A thousandth of a log's values may
+#: exceed it, since sensors have outliers.
+_IMPOSSIBLE, _OUTLIERS = 2.0, 1e-3
 #: Correlation of force and angle below minus which the sign of one is wrong; curves have 0.9 and more.
 _AGAINST = 0.5
 #: Samples with a reference force before which the motor has not left its place: 80 ms.
@@ -139,6 +142,14 @@ class Campaign:
         if not np.isfinite(log.force_N).any():
             self.fault(
                 f"{part}: {log.path}: holds no reference clamp force (RIG_{log.corner}_Force); needed: {need}; left out"
+            )
+            return None
+        rated_N = self.datasheet.actuator.rated_clamp_force_N
+        reached_N = float(np.nanquantile(log.force_N, 1.0 - _OUTLIERS))
+        if reached_N > _IMPOSSIBLE * rated_N:
+            self.fault(
+                f"{part}: {log.path}: the reference force reaches {1e-3 * reached_N:.3g} kN, which no brake of "
+                f"{1e-3 * rated_N:.3g} kN does: jammed, or in another unit; needed: {need}; left out"
             )
             return None
         return log
