@@ -1,14 +1,13 @@
 """What a search fits: coordinates, the bench that runs the estimator, and heat and force in turn."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 from diagnosekit import drives, with_late
 
-from emb_daemon.calibration.parameters import moved, value_of
+from emb_daemon.calibration.parameters import CLEARANCE, CLEARANCE_SIGMA, moved, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import search
@@ -20,12 +19,11 @@ from emb_daemon.diagnose.residuals import Bench, make_trial
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.selection import Selection
 from emb_daemon.effects import REGISTRY
-from emb_daemon.identify.steps import attribution
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.offline.run import held, run_step
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.scenarios import simulate_log
+from emb_daemon.plant.scenarios import rest, simulate_log
 from studies.blind import campaign
 from studies.drives import training
 
@@ -149,15 +147,28 @@ def test_each_log_has_its_own_pads(calibration):
     assert np.array_equal(together, np.concatenate(alone)) and not np.array_equal(*alone)
 
 
-def test_a_contact_that_what_was_found_has_moved_is_as_unsure_as_that(calibration):
-    """Logs of curves have found their own contact; of a drive, whose contact the fit of a term has moved, it is not known."""
+def test_a_contact_is_as_unsure_as_what_was_found_leaves_it(calibration):
+    """Curves found theirs 1.4 rad apart, which something else explains; a drive's, which fitted none, is 0.3 rad from them."""
     start = calibration.contact.clearance_rad
-    coordinates = base_coordinates(calibration, [start + 1.0, start])[:2]
-    fitted = dict(zip(coordinates, (start + 1.0, start + 0.3), strict=True))
-    found = attribution._contact(SimpleNamespace(applied=lambda: fitted), calibration, 1)
-    assert found.clearance_rad == start
-    assert found.clearance_sigma_rad == pytest.approx(np.hypot(calibration.contact.clearance_sigma_rad, 0.3))
-    assert attribution._contact(SimpleNamespace(applied=dict), calibration, 1) == calibration.contact
+    calibration = moved(calibration, {CLEARANCE_SIGMA: float(np.hypot(1.4, 0.1))})
+    log = log_of(simulate_log(plant_from_calibration(calibration), rest(2.0), seed=3)[0])
+    apart = start + 1.4 * np.sqrt(0.5) * np.array([1.0, -1.0])
+    mounted = [*({CLEARANCE: float(c)} for c in apart), {}]
+    of_logs = base_coordinates(calibration, [*apart, start])[:3]
+    found = dict(zip(of_logs, (start, start, start + 0.3), strict=True))
+    bench = Bench([log] * 3, calibration, mounted, own_data=True)
+    assert bench.calibrated(found).contact.clearance_sigma_rad == pytest.approx(np.hypot(0.1, 0.3))
+    assert bench.calibrated(found).contact.clearance_rad == pytest.approx(start + 0.1), "the mean of all"
+    # Of logs with curves that nothing has moved, the scatter is what it was; what was found is no other calibration's.
+    of_drive = {of_logs[2]: start + 0.3}
+    assert bench.calibrated(of_drive).contact.clearance_sigma_rad == pytest.approx(np.linalg.norm((1.4, 0.1, 0.3)))
+    further = bench.under(bench.calibrated(found))
+    assert further.calibrated(found).contact.clearance_sigma_rad == pytest.approx(np.hypot(0.1, 0.3))
+    assert (
+        bench.calibrated({})
+        == calibration
+        == moved(Bench([log] * 3, calibration, mounted).calibrated(found), {CLEARANCE: start})
+    )
 
 
 @pytest.mark.parametrize("known", [False, True])

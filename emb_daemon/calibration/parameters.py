@@ -24,7 +24,8 @@ from emb_daemon.errors import InputError, InputErrors
 #: Keys that several parts of the program use.
 TORQUE_CONSTANT, INERTIA = "motor.torque_constant_Nm_per_A", "motor.inertia_kg_m2"
 LOAD_FRICTION, OFFSET_FRICTION = "friction.load_m_per_rad", "friction.offset_Nm"
-PRESLIDING_ANGLE, CLEARANCE = "friction.presliding_angle_rad", "contact.clearance_rad"
+PRESLIDING_ANGLE = "friction.presliding_angle_rad"
+CLEARANCE, CLEARANCE_SIGMA = "contact.clearance_rad", "contact.clearance_sigma_rad"
 
 #: Step of a numerical derivative, relative to the size of the parameter. With it the errors of rounding and of curvature are
 #: both far below the residuals of a fit, and few samples cross a switch such as contact or a reversal.

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.parameters import CLEARANCE, CLEARANCE_SIGMA, moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
 from emb_daemon.diagnose.episodes import episodes, standing, yielding
@@ -235,6 +235,10 @@ def _told_by_signals(logs: Sequence[Log], calibration: Calibration) -> dict[str,
     return result
 
 
+def _variance(values: Sequence[float]) -> float:
+    return float(np.var(values, ddof=1)) if len(values) > 1 else 0.0
+
+
 def _follows_current(effects: np.void) -> bool:
     """Whether the torque constant follows the current of its own sample, by the effects of PARAMETERS."""
     terms, current = effects["terms"], list(SIGNALS).index("current")
@@ -272,6 +276,10 @@ class Bench:
         self.told: dict[str, float] = _told_by_signals(logs, calibration)
 
         self.trials: list[Trial] = list(self.map(self._trial, range(len(logs)), logs, mounted))
+        #: By log, the clearances in rad whose scatter the calibration's sigma holds, and the variance that it holds besides.
+        self.clearances: dict[int, float] = {t.index: c for t in self.trials if (c := t.mounted.get(CLEARANCE, 0.0)) > 0.0}
+        unsure = calibration.contact.clearance_sigma_rad**2 - _variance([*self.clearances.values()])
+        self.clearance_variance: float = max(unsure, 0.0)
         self.has_reference: bool = all(trial.has_force for trial in self.trials)
         self.clamps: bool = calibration.contact.is_in_reach
         self.has_current: bool = any(trial.log.samples["has_current"].any() for trial in self.trials)
@@ -398,7 +406,19 @@ class Bench:
     def calibrated(self, values: Values, log: int | None = None) -> Calibration:
         """The calibration with coordinates at ``values``; with ``log`` as they apply to that one, its own pads mounted."""
         base = self.calibration if log is None else self.on(self.trials[log])
-        return moved(base, by_key(values, self.middle, log))
+        return moved(base, by_key(values, self.middle, log) | self._scatter(values))
+
+    def _scatter(self, values: Values) -> dict[str, float]:
+        """How unsure the next power-on is of its contact, where curves were fitted to these logs: by what moves the contact of
+        single logs, less for what else explains that (an uneven disc, which no curve knows), more for a drive's."""
+        found = {c.log: value for c, value in values.items() if c.name == CLEARANCE}
+        if not found or not self.own_data:
+            return {}
+        of_curves = [found.pop(log, known) for log, known in self.clearances.items()]
+        middle = np.mean(of_curves) if of_curves else self.calibration.contact.clearance_rad
+        of_drives = np.mean((np.array([*found.values()]) - middle) ** 2) if found else 0.0
+        variance = self.clearance_variance + _variance(of_curves) + of_drives
+        return {CLEARANCE_SIGMA: float(np.sqrt(variance))}
 
     def on(self, trial: Trial, calibration: Calibration | None = None) -> Calibration:
         """A calibration, the bench's own if none is given, for the pads that a log has."""

@@ -11,13 +11,13 @@ import numpy as np
 from msgspec.structs import replace
 
 from emb_daemon.calibration.parameters import CLEARANCE, moved, value_of
-from emb_daemon.calibration.types import Calibration, Contact
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.confirmation import refit
 from emb_daemon.diagnose.coordinates import by_key
 from emb_daemon.diagnose.diagnosis import EPISODES, Diagnosis, diagnose_bench, undecided, with_terms
 from emb_daemon.diagnose.page import sections
 from emb_daemon.diagnose.residuals import Bench
-from emb_daemon.diagnose.selection import Progress, Selection
+from emb_daemon.diagnose.selection import Progress
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.estimator.heat import TOUCHING_N
 from emb_daemon.identify.dynamics import Errors
@@ -26,7 +26,6 @@ from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, unexplained_current
 from emb_daemon.offline import Log
-from emb_daemon.offline.score import rmse
 from emb_daemon.report.page import Page
 
 #: Share of the motor's largest speed from which a clamp shows lag and inertia as well as random motion.
@@ -99,8 +98,8 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
     if bench.episodes < EPISODES:
         return _unsearched(hot, known)
     found = diagnose_bench(bench, None, progress)
-    contact, residual = _contact(found.selection, known, len(logs)), found.selection.model.residual["stiffness"]
-    calibration = replace(found.calibration, contact=contact, noise=known.noise, provenance=None)
+    residual = found.selection.model.residual["stiffness"]
+    calibration = replace(found.calibration, noise=known.noise, provenance=None)
     return AttributionStep(
         sigmas=found.calibration.provenance.sigmas,
         calibration=calibration,
@@ -110,15 +109,6 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
         fastest_rad_per_s=_fastest(hot),
         undecided=undecided(found.selection),
     )
-
-
-def _contact(selection: Selection, known: Calibration, drives: int) -> Contact:
-    """The contact as known, with the uncertainty that the fit of what was found leaves: how far it moves the contact angle of
-    logs from number ``drives`` on, which fitted no curve."""
-    clearances = [value for c, value in selection.applied().items() if c.name == CLEARANCE and c.log >= drives]
-    off = [clearance - known.contact.clearance_rad for clearance in clearances]
-    sigma = np.hypot(known.contact.clearance_sigma_rad, rmse(np.array(off)) if off else 0.0)
-    return replace(known.contact, clearance_sigma_rad=float(sigma))
 
 
 def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:

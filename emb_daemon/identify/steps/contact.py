@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import CLEARANCE
+from emb_daemon.calibration.parameters import CLEARANCE, CLEARANCE_SIGMA
 from emb_daemon.identify.dynamics import simulate
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
@@ -39,7 +39,7 @@ def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> 
     return Step(
         values={
             CLEARANCE: float(np.mean(found)),
-            "contact.clearance_sigma_rad": float(np.sqrt(spread**2 + np.mean(errors**2) + count_rad**2 / 12.0)),
+            CLEARANCE_SIGMA: float(np.sqrt(spread**2 + np.mean(errors**2) + count_rad**2 / 12.0)),
             "contact.walk_rad_per_sqrt_s": _walk(stiffness),
         },
         notes=notes,
