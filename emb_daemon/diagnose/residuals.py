@@ -406,19 +406,20 @@ class Bench:
     def calibrated(self, values: Values, log: int | None = None) -> Calibration:
         """The calibration with coordinates at ``values``; with ``log`` as they apply to that one, its own pads mounted."""
         base = self.calibration if log is None else self.on(self.trials[log])
-        return moved(base, by_key(values, self.middle, log) | self._scatter(values))
+        return moved(base, by_key(values, self.middle, log) | self._contact(values, log))
 
-    def _scatter(self, values: Values) -> dict[str, float]:
-        """How unsure the next power-on is of its contact, where curves were fitted to these logs: by what moves the contact of
-        single logs, less for what else explains that (an uneven disc, which no curve knows), more for a drive's."""
+    def _contact(self, values: Values, log: int | None) -> dict[str, float]:
+        """Where the next power-on finds its contact, and how unsure it is of that, where curves were fitted to these logs: by
+        the contact of single logs, which scatters less if something else explains that (an uneven disc, which no curve knows),
+        and more for drives, whose heat has moved it."""
         found = {c.log: value for c, value in values.items() if c.name == CLEARANCE}
         if not found or not self.own_data:
             return {}
-        of_curves = [found.pop(log, known) for log, known in self.clearances.items()]
-        middle = np.mean(of_curves) if of_curves else self.calibration.contact.clearance_rad
+        of_curves = [found.pop(number, known) for number, known in self.clearances.items()]
+        middle = float(np.mean(of_curves)) if of_curves else self.calibration.contact.clearance_rad
         of_drives = np.mean((np.array([*found.values()]) - middle) ** 2) if found else 0.0
         variance = self.clearance_variance + _variance(of_curves) + of_drives
-        return {CLEARANCE_SIGMA: float(np.sqrt(variance))}
+        return {CLEARANCE_SIGMA: float(np.sqrt(variance))} | ({CLEARANCE: middle} if log is None else {})
 
     def on(self, trial: Trial, calibration: Calibration | None = None) -> Calibration:
         """A calibration, the bench's own if none is given, for the pads that a log has."""
