@@ -833,9 +833,17 @@ def test_inertia_alone_turns_no_torque_sensor_round(tmp_path, capsys):
     assert "scale: -1" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("load", [0.0, 400.0])
-@pytest.mark.parametrize(("factor", "said"), [(-1.0, "as if friction drove the motor: `scale: -1` of MotorAngle"), (1.0, "")])
-def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
+@pytest.mark.parametrize(
+    ("load", "factor", "of_current", "said"),
+    [
+        (0.0, 1.0, 1.0, ""),
+        (0.0, -1.0, 1.0, "as if friction drove the motor: `scale: -1` of MotorAngle"),
+        (400.0, 1.0, 1.0, ""),
+        (400.0, -1.0, 1.0, "as if friction drove the motor: `scale: -1` of MotorAngle"),
+        (400.0, 1.0, -1.0, "as if friction drove the motor: `scale: -1` of CurrentQ"),
+    ],
+)
+def test_friction_drives_no_motor(tmp_path, capsys, load, factor, of_current, said):
     """A motor to and fro against a torque sensor, load and stroke of their own; and one that turns free, at either end of its
     travel with a current of its own (cogging), which is nothing that clamps."""
     rng, time_s = np.random.default_rng(4), 0.004 * np.arange(5000)
@@ -845,7 +853,8 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
     current = 0.02 * force + 0.8 * np.sign(speed) + 2e-4 * np.gradient(speed, time_s) + rng.normal(0.0, 0.1, len(time_s))
     if not load:
         current += 0.5 * (angle < -25.0)
-    columns = {"time_s": time_s, "angle_rad": factor * angle, "speed_rad_per_s": factor * speed, "current_A": current}
+    columns = {"time_s": time_s, "angle_rad": factor * angle, "speed_rad_per_s": factor * speed}
+    columns["current_A"] = of_current * current
     free = foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}")
     columns |= {"force_N": force, "plate_C": 22.0 + 0.0 * time_s}
     _read(tmp_path, columns, foreignkit.COLUMNS if load else free)

@@ -474,12 +474,12 @@ def _find_driving_friction(speed: Series, current: Series, force: Series | float
     correlation = float(np.corrcoef(left.T)[0, 1]) if np.all(np.ptp(left, axis=0) > 0.0) else 0.0
     if correlation > -_AGAINST:
         return []
-    # A current that is turned round opposes a constant load, too. Its mean over both ways is the load's.
-    ways_A = [float(np.mean(current.values[moving][direction == way])) for way in (1.0, -1.0)]
-    is_current = not isinstance(force, Series) and sum(ways_A) * force < 0.0
+    # A current that is turned round opposes its load, too; a motion that is turned round does not turn what the load needs.
+    explaining = np.column_stack([known[:, 1:], direction, *([known[:, 0]] if isinstance(force, Series) else [])])
+    of_load_A_per_N = np.linalg.lstsq(explaining, columns[:, 0])[0][0]
     return [
         f"CurrentQ is less in the direction of motion than against it (correlation {correlation:.2f}), as if friction drove "
-        f"the motor: `scale: -1` of {'CurrentQ' if is_current else 'MotorAngle and MotorSpeed'}?"
+        f"the motor: `scale: -1` of {'CurrentQ' if of_load_A_per_N < 0.0 else 'MotorAngle and MotorSpeed'}?"
     ]
 
 
