@@ -409,9 +409,9 @@ def test_a_motor_that_turns_on_and_on_is_followed(capsys):
     ("lost", "term", "equation"),
     [
         # In proportion to the current and not to its square, as no effect of the catalogue has it.
-        (lambda current, speed, made: 0.15 * made * np.abs(current) / 13.0, "torque_constant:current", r"K_m × \(1 \+ -0\.1"),
+        (lambda current, speed, made: 0.15 * made * np.abs(current) / 13.0, "torque_constant:current", r"K_m × \(1 − 0\.1"),
         # Air that a rotor drags along. A torque and a friction over the speed are one where a motor turns one way.
-        (lambda current, speed, made: 0.08 * (speed / 190.0) ** 2, "torque:motor_speed", r"T_m \+ -0\.0[78]\d* N·m"),
+        (lambda current, speed, made: 0.08 * (speed / 190.0) ** 2, "torque:motor_speed", r"T_m − 0\.0[78]\d* N·m"),
     ],
 )
 def test_a_term_is_made_for_a_motor_that_turns_on_and_on(lost, term, equation):

@@ -472,6 +472,44 @@ def test_an_angle_of_few_samples_that_starts_anew_is_told_from_a_fast_motion(tmp
     assert "start anew" not in capsys.readouterr().err
 
 
+def _hoist(**factors: float) -> dict:
+    """A weight that a motor lifts and lowers, 31 rows a second that a busy computer reads late and stamps when it does, one in
+    twenty by 0.1 s; friction needs a fifth of the weight's current. Columns are as stated times a factor."""
+    rng = np.random.default_rng(1)
+    time_s = np.arange(1240) / 31.0
+    speed = 6.0 * np.clip(4.0 * np.sin(2.0 * np.pi * time_s / 20.0), -1.0, 1.0) + rng.normal(0.0, 0.05, 1240)
+    late = rng.uniform(0.0, 0.01, 1240) + 0.1 * (rng.uniform(size=1240) < 0.05)
+    columns = {
+        "time_s": np.maximum.accumulate(time_s + late) + 1e-6 * np.arange(1240),
+        "angle_rad": np.cumsum(speed) / 31.0,
+        "speed_rad_per_s": speed,
+        "current_A": 5.0 + np.sign(speed) + rng.normal(0.0, 0.2, 1240),
+        "plate_C": np.full(1240, 22.0),
+    }
+    return {name: factors.get(name, 1.0) * values for name, values in columns.items()}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({}, ""),
+        ({"speed_rad_per_s": 1.0 / 60.0}, "times as fast (turns per minute taken for turns per second, or the reverse)"),
+        ({"current_A": -1.0}, "as if friction drove the motor: `scale: -1` of CurrentQ?"),
+        (
+            {"angle_rad": -1.0, "speed_rad_per_s": -1.0},
+            "as if friction drove the motor: `scale: -1` of MotorAngle and MotorSpeed?",
+        ),
+    ],
+)
+def test_a_hoist_of_late_rows_tells_a_wrong_unit_and_direction(tmp_path, capsys, wrong, said):
+    """What lies between its rows is unknown, but not how far it went in ten of them nor which way friction acts. Of a weight
+    a current that is turned round has the wrong sign, a motion that is turned round has not."""
+    _read(tmp_path, _hoist(**wrong), foreignkit.COLUMNS.replace("signal: force_N, unit: N", "value: 4000"))
+    told = capsys.readouterr().err
+    assert said in told and ("scale" in told or "times as fast" in told) == bool(said)
+    assert "too rare for this motion: what lies between two samples is unknown, and is not filled in" in told
+
+
 def test_slow_motion_with_the_stamps_of_a_busy_computer_is_not_too_rare(tmp_path, capsys):
     """Ten radians a second, stamped up to six milliseconds early or late, as it was sampled."""
     samples = _read(tmp_path, _joint(jitter_ms=6.0)).samples
@@ -795,9 +833,17 @@ def test_inertia_alone_turns_no_torque_sensor_round(tmp_path, capsys):
     assert "scale: -1" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("load", [0.0, 400.0])
-@pytest.mark.parametrize(("factor", "said"), [(-1.0, "as if friction drove the motor: `scale: -1` of MotorAngle"), (1.0, "")])
-def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
+@pytest.mark.parametrize(
+    ("load", "factor", "of_current", "said"),
+    [
+        (0.0, 1.0, 1.0, ""),
+        (0.0, -1.0, 1.0, "as if friction drove the motor: `scale: -1` of MotorAngle"),
+        (400.0, 1.0, 1.0, ""),
+        (400.0, -1.0, 1.0, "as if friction drove the motor: `scale: -1` of MotorAngle"),
+        (400.0, 1.0, -1.0, "as if friction drove the motor: `scale: -1` of CurrentQ"),
+    ],
+)
+def test_friction_drives_no_motor(tmp_path, capsys, load, factor, of_current, said):
     """A motor to and fro against a torque sensor, load and stroke of their own; and one that turns free, at either end of its
     travel with a current of its own (cogging), which is nothing that clamps."""
     rng, time_s = np.random.default_rng(4), 0.004 * np.arange(5000)
@@ -807,7 +853,8 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, said):
     current = 0.02 * force + 0.8 * np.sign(speed) + 2e-4 * np.gradient(speed, time_s) + rng.normal(0.0, 0.1, len(time_s))
     if not load:
         current += 0.5 * (angle < -25.0)
-    columns = {"time_s": time_s, "angle_rad": factor * angle, "speed_rad_per_s": factor * speed, "current_A": current}
+    columns = {"time_s": time_s, "angle_rad": factor * angle, "speed_rad_per_s": factor * speed}
+    columns["current_A"] = of_current * current
     free = foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}")
     columns |= {"force_N": force, "plate_C": 22.0 + 0.0 * time_s}
     _read(tmp_path, columns, foreignkit.COLUMNS if load else free)

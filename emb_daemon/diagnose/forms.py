@@ -359,12 +359,12 @@ def equation(term: Term) -> str:
     if term.memory == "response":
         shaped, times = f"lag of {term.memory_scale:.3g} s of {shaped}{times}", ""
     gate = times + {"always": "", "load": " × F/F_max"}.get(term.gate, f", {term.gate}")
-    size = f"{np.hypot(term.coefficient, term.sine):.3g}" if term.shape == "harmonic" else f"{term.coefficient:.3g}"
-    if not term.coefficient and not term.sine:
-        size = "c"
+    coefficient = float(np.hypot(term.coefficient, term.sine)) if term.shape == "harmonic" else term.coefficient
+    size = f"{abs(coefficient):.3g}" if coefficient else "c"
+    sign = "−" if coefficient < 0.0 else "+"
     factor = HOOKS[term.port].unit == "1"
     unit = "" if factor else f" {term.unit}"
-    return f"{quantity} × (1 + {size} · {shaped}{gate})" if factor else f"{quantity} + {size}{unit} · {shaped}{gate}"
+    return f"{quantity} × (1 {sign} {size} · {shaped}{gate})" if factor else f"{quantity} {sign} {size}{unit} · {shaped}{gate}"
 
 
 assert all(port in PORTS and signal in SIGNALS for port, own in _TYPED.items() for signal in own)

@@ -110,8 +110,10 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         lines += _find_rounded(corner, angle, current, bare)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
     moves = not (speed is None or current is None or is_unresolved(corner, messages))
-    if moves and (force is not None or is_free):
-        lines += _find_driving_friction(speed, current, force)
+    load = force if force is not None else messages[f"RIG_{corner}_Force"]["ClampForceRef"] if is_free else None
+    if speed is not None and current is not None and load is not None and (moves or (bare and speed.is_resolved)):
+        lines += _find_driving_friction(speed, current, load)
+    if moves and load is not None:
         lines += _find_supply(speed, current, force) if force is not None else []
         # What relaxes in pads looks like a delay.
         lines += _find_late_current(speed, current, force) if bare else []
@@ -458,10 +460,10 @@ def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
     ]
 
 
-def _find_driving_friction(speed: Series, current: Series, force: Series | None) -> list[str]:
+def _find_driving_friction(speed: Series, current: Series, force: Series | float) -> list[str]:
     """A line if the current that neither load nor inertia explains opposes the motion, which friction's does not."""
     times = current.time_ns
-    at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
+    at, load = speed.sampled(times), force.sampled(times) if isinstance(force, Series) else np.full(len(times), force)
     moving = np.isfinite(load) & (np.abs(at) > _MOVING * np.nanquantile(np.abs(at), 0.99))
     direction = np.sign(at[moving])
     if min(np.sum(direction > 0.0), np.sum(direction < 0.0)) < _LEAST:
@@ -472,9 +474,12 @@ def _find_driving_friction(speed: Series, current: Series, force: Series | None)
     correlation = float(np.corrcoef(left.T)[0, 1]) if np.all(np.ptp(left, axis=0) > 0.0) else 0.0
     if correlation > -_AGAINST:
         return []
+    # A current that is turned round opposes its load, too; a motion that is turned round does not turn what the load needs.
+    explaining = np.column_stack([known[:, 1:], direction, *([known[:, 0]] if isinstance(force, Series) else [])])
+    of_load_A_per_N = np.linalg.lstsq(explaining, columns[:, 0])[0][0]
     return [
         f"CurrentQ is less in the direction of motion than against it (correlation {correlation:.2f}), as if friction drove "
-        "the motor: `scale: -1` of MotorAngle and MotorSpeed?"
+        f"the motor: `scale: -1` of {'CurrentQ' if of_load_A_per_N < 0.0 else 'MotorAngle and MotorSpeed'}?"
     ]
 
 

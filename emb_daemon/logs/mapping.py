@@ -27,6 +27,7 @@ from emb_daemon.logs.resample import (
     Series,
     fill_missing,
     frames_of,
+    is_bare,
     is_received,
     is_unresolved,
     our_messages,
@@ -576,11 +577,14 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
     angle = way_of(corner, messages)
     if angle is None or len(angle.time_ns) < 3 or starts_anew(angle) or not is_unresolved(corner, messages):
         return []
-    return [
-        f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: a clamp takes 200 ms, "
-        "and what lies between two samples is unknown; the torque path says nothing, and identify needs 10 ms (100 Hz) "
-        "or a slower motion"
-    ]
+    unknown = "what lies between two samples is unknown"
+    why = (
+        f"{unknown}, and is not filled in"
+        if is_bare(corner, messages)
+        else f"a clamp takes 200 ms, and {unknown}; the torque path says nothing, and identify needs 10 ms (100 Hz) or a "
+        "slower motion"
+    )
+    return [f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: {why}"]
 
 
 _BENCH = "of a bench say so by `value: 0` of ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp"

@@ -64,6 +64,8 @@ _WAY_RAD, _CORRELATED, _OTHER_SCALE, _NAMED = 1.0, 0.8, 0.1, 0.04
 #: Correlation of a speed with its next sample from which the mean of the two is the speed between them: of a sine it is the
 #: cosine of the phase that passes, and at 0.95 (20 samples a period) the mean is 3 % small.
 _RESOLVED = 0.95
+#: Number of sparse samples over which angle and speed are compared: the jitter of their stamps is a tenth as large beside it.
+_AVERAGED = 10
 #: Relative variation of a constant value by rounding.
 _STEADY = 1e-6
 #: Ratios of units that are often confused.
@@ -168,6 +170,11 @@ class Series:
         # Long standstill does not show how stops are sampled.
         moving = np.maximum(missed, np.abs(self.values[2:] - self.values[:-2])) > _UNKNOWN_WAY_RAD
         return float(np.quantile(missed[moving], _RESOLVED_SHARE)) if moving.any() else 0.0
+
+    @cached_property
+    def is_resolved(self) -> bool:
+        """Whether it changes little from one value to the next, so that the mean of the two is what was between them."""
+        return len(self.values) > 2 and _correlation(self.values[1:], self.values[:-1]) > _RESOLVED
 
     @property
     def is_slow(self) -> bool:
@@ -291,26 +298,28 @@ def standing(messages: Mapping[str, Signals], angle_rad: float) -> dict[str, Ser
 
 
 def _another_motion(angle: Series, speed: Series) -> str:
-    """How speed and angle contradict each other; empty if they do not, or if the motion between two samples is unknown."""
-    if angle.is_sparse:
-        return ""
+    """How speed and angle contradict each other; empty if they do not. Between sparse samples the motion is unknown, but not
+    how far a speed that changes slowly goes."""
     steps = np.diff(angle.time_ns)
-    near = (steps > 0) & (steps <= _CARRIED_PERIODS * angle.period_ns)
+    # What a busy computer stamps late it makes up for in the next rows: neither is left out.
+    near = (steps > 0) & (steps <= (_PAUSE if angle.is_sparse else _CARRIED_PERIODS) * angle.period_ns)
     at = speed.sampled(angle.time_ns)
     way, turned = np.diff(angle.values), 0.5e-9 * (at[1:] + at[:-1]) * steps
     known = near & np.isfinite(turned)
     if not known.any():
         return ""
-    moved, explained = float(np.sum(np.abs(way[known]))), float(np.sum(np.abs(turned[known])))
+    went, told = way[known], turned[known]
+    if angle.is_sparse:
+        went, told = (np.add.reduceat(column, np.arange(0, len(column), _AVERAGED)) for column in (went, told))
+    moved, explained = float(np.sum(np.abs(went))), float(np.sum(np.abs(told)))
     # The sum of noise is no travel.
-    if (
-        min(moved, explained) > _WAY_RAD
-        and abs(ratio := float(way[known] @ turned[known] / (turned[known] @ turned[known]))) > 0.0
-    ):
-        correlation = _correlation(way[known], turned[known])
+    if min(moved, explained) > _WAY_RAD and abs(ratio := float(went @ told / (told @ told))) > 0.0:
+        correlation = _correlation(went, told)
         resolved = _correlation(at[1:][known], at[:-1][known]) > _RESOLVED
         if resolved and abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
             return f"is another motion than MotorAngle, which changes {ratio:.4g} times as fast ({_meaning(ratio)})"
+    if angle.is_sparse:
+        return ""
     apart = np.abs(way - turned) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
     share = float(np.mean(apart[near]))
     if share <= _MOST_APART:
@@ -330,10 +339,9 @@ def _correlation(one: np.ndarray, other: np.ndarray) -> float:
 def _meaning(ratio: float) -> str:
     """Possible causes of an angle that changes ``ratio`` times as fast as the speed says."""
     sign = "a direction turned round" if ratio < 0.0 else ""
-    for known, text in _RATIOS.items():
-        for expected in (known, 1.0 / known):
-            if abs(abs(ratio) / expected - 1.0) < _NAMED:
-                return " and ".join(filter(None, [sign, text]))
+    apart, text = min((abs(abs(ratio) / e - 1.0), text) for known, text in _RATIOS.items() for e in (known, 1.0 / known))
+    if apart < _NAMED:
+        return " and ".join(filter(None, [sign, text]))
     return sign if abs(abs(ratio) - 1.0) <= _OTHER_SCALE else " and ".join(filter(None, [sign, "a wrong unit or gear"]))
 
 
