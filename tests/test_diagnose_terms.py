@@ -223,6 +223,21 @@ def test_an_effect_that_needs_a_term_beside_it_gives_way_to_one_term_that_leaves
     assert grammar._without_shadows(with_both, catalogue, "stiffness").accepted == [name]
 
 
+@pytest.mark.trial
+def test_an_effect_that_a_larger_cause_hides_is_found_beside_the_term_for_it(calibration):
+    """Pads that stiffen with friction power, on an uneven disc: what follows the brake torque alone explains far more than
+    the disc, which passes for its shadow until the term is there."""
+    pads = {"size": 0.3, "signal": PLANT_SIGNALS.index("friction_power"), "exponent": 1.5, "other": -1.0, "lag_s": 1.3}
+    disc = {"order_1_cosine_um": -6.0, "order_1_sine_um": 3.0}
+    logs = [log_of(part) for part in drives(calibration, 5, {"drawn_stiffness": pads, "disc_thickness_variation": disc})]
+    selection = search.select(Bench(logs, calibration), lambda text, share: None)
+    assert [*selection.accepted] == ["disc_thickness_variation", "term:stiffness:friction_power"]
+    found = selection.model.values
+    for name, um in disc.items():
+        [value] = [v for c, v in found.items() if c.parameter == name]
+        assert value == pytest.approx(um, abs=0.5)
+
+
 def test_an_effect_gives_way_to_no_more_terms_than_stood_beside_it(coupled, monkeypatch):
     """Two shapes of one term are one cause, as an effect is, but the effect has a name."""
     selection = coupled[0]

@@ -31,9 +31,10 @@ from emb_daemon.diagnose.prospects import (
     with_term,
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
-from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, Candidate
+from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, SHADOW, Candidate
 from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, settle_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
+from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import MOST, PORTS, SIGNALS
 from emb_daemon.offline.run import held
@@ -68,7 +69,8 @@ def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selecti
     for channel in (channel for channel in selection.model.bench.channels if channel in LASTING):
         if channel != CHANNEL_OF_HEAT and selection.model.own(channel) and _wanted(selection, channel):
             progress(f"making a term for the {channel} residual")
-            selection = _without_shadows(_with_terms(selection, channel), selection, channel)
+            found = _without_shadows(_with_terms(selection, channel), selection, channel)
+            selection = _with_hidden(found, selection, channel)
             selection = _with_orders_again(_called_by_name(selection, channel), channel)
     return selection
 
@@ -179,6 +181,19 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     fewer = len(_causes(both, channel)) < len(_causes(found, channel))
     fewer = fewer and len(_made(both, channel)) <= len(_made(found, channel))
     return both if (matters or fewer) and _description(both, channel) < _description(found, channel) else found
+
+
+def _with_hidden(found: Selection, catalogue: Selection, channel: str) -> Selection:
+    """The same with effects of the ``catalogue`` beside terms that were made, where they describe it more shortly: what was
+    refused as a shadow of something else may be there as well, now that the rest is explained."""
+    hidden = {c.effect.name for c in catalogue.candidates.values() if c.channel == channel and c.reason.endswith(SHADOW)}
+    others = frozenset(effect.name for effect in REGISTRY if effect.name not in hidden)
+    while hidden and found.accepted != catalogue.accepted:
+        asked = replace(one_round(replace(found, dropped=found.dropped | others)), dropped=found.dropped)
+        if asked.accepted == found.accepted or _description(asked, channel) >= _description(found, channel):
+            break
+        found = asked
+    return found
 
 
 def _called_by_name(selection: Selection, channel: str) -> Selection:
@@ -315,8 +330,7 @@ def _with(
     largest = _largest_beside(selection, best, channel)
     objections = {
         f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
-        f"a smooth function of {rival} explains much more: a shadow of something else": best.evidence.gain
-        < OF_MODEL_FREE * ceiling,
+        f"a smooth function of {rival} explains much more: {SHADOW}": best.evidence.gain < OF_MODEL_FREE * ceiling,
         f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > OF_PLACEBO,
         f"less than a tenth of the {largest:.3g} {UNITS[channel]} that another term does, whose shape is a guess": model.rms(
             best.evidence.gain, channel

@@ -29,6 +29,8 @@ from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import HOOKS, Effect, Placebo
 from emb_daemon.offline.score import rmse
 
+#: How the reason ends for which an effect is refused that explains much less than a smooth function of a signal.
+SHADOW = "a shadow of something else"
 #: False discovery rate over the catalogue.
 Q_VALUE = 0.01
 #: A gain matters from this share of the channel's residual, and from this share of the RMS of the reference: two parts in a
@@ -247,7 +249,7 @@ class Screening:
         ):
             shadow = (
                 f"explains {candidate.gain:.3g} {unit} RMS where a smooth function of {signal} explains "
-                f"{model.rms(gain, channel):.3g} {unit}: a shadow of something else"
+                f"{model.rms(gain, channel):.3g} {unit}: {SHADOW}"
             )
             return replace(candidate, reason=shadow)
         candidate = self.with_placebos(model, candidate)
