@@ -114,7 +114,8 @@ STATE = np.dtype(
         # learned.
         ("held", "f8", (len(CREEPS),)),
         ("creep", "f8", (len(CREEPS),)),
-        # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late.
+        # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late. What
+        # effects have ``gained`` of thickness, m, and by how much that ``swelled`` or shrank in this sample.
         *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back gained swelled"),
         *fields("f8", "torque_age balance leverage"),
         # Motor torque (N m), gear gain and gear friction over the calibration's, as its effects have them at this sample.
