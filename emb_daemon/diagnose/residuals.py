@@ -406,9 +406,9 @@ class Bench:
     def calibrated(self, values: Values, log: int | None = None) -> Calibration:
         """The calibration with coordinates at ``values``; with ``log`` as they apply to that one, its own pads mounted."""
         base = self.calibration if log is None else self.on(self.trials[log])
-        return moved(base, by_key(values, self.middle, log) | self._contact(values, log))
+        return moved(base, by_key(values, self.middle, log) | self._contact_found(values, log))
 
-    def _contact(self, values: Values, log: int | None) -> dict[str, float]:
+    def _contact_found(self, values: Values, log: int | None) -> dict[str, float]:
         """Where the next power-on finds its contact, and how unsure it is of that, where curves were fitted to these logs: by
         the contact of single logs, which scatters less if something else explains that (an uneven disc, which no curve knows),
         and more for drives, whose heat has moved it."""

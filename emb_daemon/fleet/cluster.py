@@ -82,8 +82,9 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
                     with contextlib.suppress(TimeoutError):
                         client.wait_for_workers(count, timeout=_PATIENCE_S)
         finally:
-            # What the work gave is in files; a worker that could not be closed ends with this process.
-            with contextlib.suppress(AssertionError):
+            # What the work gave is in files; a worker that could not be closed, or of whose start distributed had not heard
+            # when it died, ends with this process.
+            with contextlib.suppress(AssertionError, KeyError):
                 local.close()
 
 
