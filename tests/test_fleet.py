@@ -252,6 +252,27 @@ def test_the_end_of_the_work_waits_for_a_worker_that_is_just_started_again(monke
     assert workers[0] == 2
 
 
+@pytest.mark.parametrize("fault", [AssertionError, KeyError])
+def test_a_worker_that_distributed_cannot_close_ends_no_work(monkeypatch, fault):
+    """It dies while it is started again, or before its start was heard of. Of other faults nobody knows what they end."""
+    from distributed import LocalCluster
+
+    close = LocalCluster.close
+
+    def closes(raised):
+        def close_and_fail(local, *arguments, **named):
+            close(local, *arguments, **named)
+            raise raised
+
+        monkeypatch.setattr(LocalCluster, "close", close_and_fail)
+        with cluster(workers=1) as client:
+            return client.submit(int, 5).result()
+
+    assert closes(fault) == 5
+    with pytest.raises(RuntimeError):
+        closes(RuntimeError)
+
+
 def test_work_without_workers_ends_and_says_so(monkeypatch):
     """All may die and none come back, on a cluster of others or on a machine that is too busy."""
     from distributed import Client, LocalCluster

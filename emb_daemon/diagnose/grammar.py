@@ -186,11 +186,14 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
 def _with_hidden(found: Selection, catalogue: Selection, channel: str) -> Selection:
     """The same with effects of the ``catalogue`` beside terms that were made, where they describe it more shortly: what was
     refused as a shadow of something else may be there as well, now that the rest is explained."""
-    hidden = {c.effect.name for c in catalogue.candidates.values() if c.channel == channel and c.reason.endswith(SHADOW)}
-    others = frozenset(effect.name for effect in REGISTRY if effect.name not in hidden)
+    refused = {name for name, c in catalogue.candidates.items() if c.channel == channel and c.reason.endswith(SHADOW)}
+    hidden = {effect.name for effect in REGISTRY} & refused
+    others = frozenset(effect.name for effect in REGISTRY) - hidden
     while hidden and found.accepted != catalogue.accepted:
         asked = replace(one_round(replace(found, dropped=found.dropped | others)), dropped=found.dropped)
-        if asked.accepted == found.accepted or _description(asked, channel) >= _description(found, channel):
+        if asked.accepted == found.accepted:
+            return asked
+        if _description(asked, channel) >= _description(found, channel):
             break
         found = asked
     return found

@@ -192,11 +192,18 @@ def force_sigma(u: Record) -> float:
 
 
 @njit
+def _crest(u, order):
+    """What an order adds to the force at most, N."""
+    k = 2 * order - 2
+    return hypot(u.force[k], u.force[k + 1]) * hypot(u.amplitude[k], u.amplitude[k + 1])
+
+
+@njit
 def way_per_rad(u: Record) -> float:
     """How far it lets the force go to and fro over a rad of the wheel, N/rad."""
     total = 0.0
-    for k in range(0, STATES, 2):
-        total += (k // 2 + 1) * hypot(u.force[k], u.force[k + 1]) * hypot(u.amplitude[k], u.amplitude[k + 1])
+    for order in range(1, ORDERS + 1):
+        total += order * _crest(u, order)
     return u.share * 2.0 / pi * total
 
 
@@ -204,6 +211,6 @@ def way_per_rad(u: Record) -> float:
 def unproven(u: Record) -> float:
     """How far apart the force with and without such a disc are over a turn, N, times the probability of the less likely."""
     crest = 0.0
-    for k in range(0, STATES, 2):
-        crest += hypot(u.force[k], u.force[k + 1]) * hypot(u.amplitude[k], u.amplitude[k + 1])
+    for order in range(1, ORDERS + 1):
+        crest += _crest(u, order)
     return min(u.share, 1.0 - u.share) * crest
