@@ -198,15 +198,13 @@ def _where_worse(selection: Selection, channel: str, before: np.ndarray, after: 
     if gained <= 0.0:
         return slice(None), f"what is left of the {channel} path goes from {first:.4g} to {last:.4g} N"
     bench, floor = selection.model.bench, selection.screening.floor(selection.model, channel)
-    ends = np.cumsum([len(trial.log.samples) for trial in bench.trials])
-    logs = [slice(end - len(trial.log.samples), end) for trial, end in zip(bench.trials, ends, strict=True)]
-    pairs = [(rmse(before[rows]), rmse(after[rows])) for rows in logs]
+    pairs = [(rmse(before[rows]), rmse(after[rows])) for rows in bench.rows]
     worst = int(np.argmax([last**2 - first**2 for first, last in pairs]))
     first, last = pairs[worst]
     if last <= _LOG_HARM * first or last**2 - first**2 < max(floor**2, gained):
         return None
     name = bench.trials[worst].log.path.name
-    return logs[worst], f"what is left of the {channel} path on {name} goes from {first:.4g} to {last:.4g} N"
+    return bench.rows[worst], f"what is left of the {channel} path on {name} goes from {first:.4g} to {last:.4g} N"
 
 
 def _fits_without(selection: Selection, without: str) -> Iterator[tuple[np.ndarray, dict[Coordinate, float]]]:

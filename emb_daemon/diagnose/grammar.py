@@ -21,6 +21,7 @@ from emb_daemon.diagnose.model import LASTING, LITTLE, TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
+    NEARLY,
     NOTHING,
     Prospect,
     Screen,
@@ -115,10 +116,13 @@ def _restated(found: Selection, before: Selection, channel: str) -> Selection:
 
 def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int | None = None) -> list[Selection]:
     """A selection with a term of the candidate's port and signals in each shape that holds, of at ``most`` so many that gain
-    most."""
+    most, and as much as may be the best once fitted."""
     search, result = _search(start.model, channel), []
-    prospects = search.of_means(candidate.effect.hook, candidate.signals)
-    for prospect in sorted(prospects, key=lambda p: -p.evidence.gain)[:most]:
+    prospects = sorted(search.of_means(candidate.effect.hook, candidate.signals), key=lambda p: p.evidence.gain)
+    nearly = [p for p in prospects if p.evidence.gain >= NEARLY * prospects[-1].evidence.gain]
+    # Of one structure that which gains most: fits lead from one size to another.
+    structures = {replace(p.form, **dict.fromkeys(p.form.fitted, 0.0)): p for p in nearly}
+    for prospect in sorted(structures.values(), key=lambda p: -p.evidence.gain)[:most]:
         effect = made_effect(prospect.form, _name(prospect.form, start))
         new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
         other = _enter(start, new, prospect.form) if prospect.evidence.gain > 0.0 else start

@@ -48,6 +48,7 @@ class Model:
         residual: by channel.
         heat: of each log (`held_heat.run_with_heat`); coordinates that stand at nothing do not change it.
         columns: regressors, minus the derivative of the channel's residual, at the last fit.
+        stood: by channel, bench, values and heat of that: where nothing has moved since, a fit begins with them.
         fits: by channel.
     """
 
@@ -58,6 +59,7 @@ class Model:
     centre: Values = field(default_factory=dict)
     chosen: frozenset[Coordinate] = frozenset()
     columns: Mapping[Coordinate, np.ndarray] = field(default_factory=dict, repr=False)
+    stood: Mapping[str, tuple[Bench, Values, Sequence[np.ndarray | None]]] = field(default_factory=dict, repr=False)
     fits: Mapping[str, Fit] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -157,8 +159,10 @@ class Model:
         own, episode = tuple(self.own(channel)), self.bench.episode[channel]
         # In units of what an episode knows, as priors are.
         scale = float(np.sqrt(self.inflation(channel) * max(self.noise(channel), 1e-12)))
-        slopes: dict[tuple, np.ndarray] = {}
         start = tuple(self.values[c] for c in own)
+        bench, values, heat = self.stood.get(channel, (None, None, None))
+        as_left = bench is self.bench and values == self.values and heat is self.heat
+        known = {start: np.column_stack([self.columns[c] for c in own])} if as_left else {}
 
         # Derivatives, and the model in the end, are asked for where the residual was asked for last.
         @lru_cache(maxsize=2)
@@ -180,25 +184,30 @@ class Model:
         def residual(tried: Values) -> np.ndarray:
             return own_residual(*(tried[c] for c in own))[0] / scale
 
-        def derivative(tried: Values) -> np.ndarray:
+        def columns(tried: Values) -> np.ndarray:
             key = () if self.bench.straight and channel not in FORCE_CHANNELS else tuple(tried[c] for c in own)
-            if key not in slopes:
+            if key not in known:
                 at, heat = own_residual(*(tried[c] for c in own))
                 found = self.bench.regressors(self.values | dict(tried), [Probe(c) for c in own], {channel: at}, heat)
-                slopes[key] = -np.column_stack(found) / scale
-            return slopes[key]
+                known[key] = np.column_stack(found)
+            return known[key]
+
+        def derivative(tried: Values) -> np.ndarray:
+            return columns(tried) / -scale
 
         prior = {c: (self.centre.get(c, c.start), c.prior) if np.isfinite(c.prior) else None for c in own}
         free = {c: Free(self.values[c], c.step, c.low, c.high, prior[c]) for c in own}
         found = fit([Block(residual, own, episode, derivative)], free, tolerance=TOLERANCE, evaluations=_EVALUATIONS)
-        table = -scale * derivative(found.values)
-        left, heat = run(*(found.values[c] for c in own))
+        ended = tuple(found.values[c] for c in own)
+        left, heat = run(*ended)
+        values, asked = self.values | found.values, own_residual(*ended)[1]
         return replace(
             self,
-            values=self.values | found.values,
+            values=values,
             residual=left,
             heat=heat,
-            columns={**self.columns, **dict(zip(own, table.T, strict=True))},
+            columns={**self.columns, **dict(zip(own, columns(found.values).T, strict=True))},
+            stood={**self.stood, channel: (self.bench, values, asked)},
             fits={**self.fits, channel: found},
         )
 

@@ -32,7 +32,7 @@ _SHORTLIST = 10
 #: more apart, and between two signals that resemble each other the better guess of an exponent would decide.
 _SHARPENED, _TRIES = 24, 8
 #: Share of the best gain from which another port or signal is as good, and from which it may be once its sizes are fitted.
-AS_GOOD, _NEARLY = 0.95, 0.9
+AS_GOOD, NEARLY = 0.95, 0.9
 #: Signals at their ports that are multiplied by others: what says nothing alone rarely does in a product (weak heredity,
 #: Chipman, Canadian J. Statistics 24, 1996).
 _LEADING = 10
@@ -382,7 +382,7 @@ def _best_of(forms: Sequence[Form], gains: np.ndarray, most: int) -> list[Form]:
 def _sharpen(search: Search, forms: Sequence[Form], gains: np.ndarray) -> list[Form]:
     """The best of some forms with their sizes where left-out episodes gain most."""
     best = _best_of(forms, gains, _SHARPENED)
-    best += _of_other_means(forms, gains, best, _NEARLY)
+    best += _of_other_means(forms, gains, best, NEARLY)
     found = list(search.model.bench.map(lambda form: _fit_sizes(search, form), best))
     best, gains = [form for form, _ in found], np.array([gain for _, gain in found])
     chosen = _best_of(best, gains, _SHORTLIST)

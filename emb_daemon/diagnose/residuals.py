@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -361,7 +362,13 @@ class Bench:
 
     def by_log(self, column: np.ndarray) -> list[np.ndarray]:
         """A column over the samples of all logs, cut where each log ends."""
-        return np.split(column, np.cumsum([len(trial.log.samples) for trial in self.trials])[:-1])
+        return [column[rows] for rows in self.rows]
+
+    @cached_property
+    def rows(self) -> list[slice]:
+        """Of each log among the samples of all."""
+        ends = np.cumsum([0] + [len(trial.log.samples) for trial in self.trials])
+        return [slice(*pair) for pair in pairwise(ends)]
 
     def _channels(self) -> list[str]:
         if self.has_reference and (self.clamps or self.has_current):
@@ -524,19 +531,26 @@ class Bench:
             tried[coordinate] = now + step
             follows = coordinate.channel not in FORCE_CHANNELS or coordinate.name == HISTORY_TIME
             known = [None] * len(heat) if follows else heat
-            return (at[coordinate.channel] - self.residual_held(tried, coordinate.channel, known)) / step
+            if coordinate.log is None:
+                return (at[coordinate.channel] - self.residual_held(tried, coordinate.channel, known)) / step
+            column, own = np.zeros_like(at[coordinate.channel]), coordinate.log
+            rows = self.rows[own]
+            here = self._residual_held_of(self.trials[own], tried, coordinate.channel, known[own])
+            column[rows] = (at[coordinate.channel][rows] - here) / step
+            return column
 
         return list(self.map(answer, probes))
 
     def residual_held(self, values: Values, channel: str, heat: Sequence[np.ndarray | None]) -> np.ndarray:
         """One channel's residual, with the heat of a log held where it is given (`held_heat.run_held`)."""
-        parts = []
-        for trial, known in zip(self.trials, heat, strict=True):
-            samples, parameters = trial.log.samples, self.parameters_of(trial, values)
-            trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
-            per_ampere = self._per_ampere(trial, parameters, known, trace)
-            parts.append(self.residual_of(trial, trace, channel, per_ampere))
-        return np.concatenate(parts)
+        pairs = zip(self.trials, heat, strict=True)
+        return np.concatenate([self._residual_held_of(trial, values, channel, known) for trial, known in pairs])
+
+    def _residual_held_of(self, trial: Trial, values: Values, channel: str, known: np.ndarray | None) -> np.ndarray:
+        samples, parameters = trial.log.samples, self.parameters_of(trial, values)
+        trace = run_step(samples, parameters) if known is None else run_held(samples, parameters, known)
+        per_ampere = self._per_ampere(trial, parameters, known, trace)
+        return self.residual_of(trial, trace, channel, per_ampere)
 
 
 @dataclass(frozen=True)
