@@ -294,11 +294,9 @@ def test_noise_with_which_the_validation_logs_get_worse_is_not_written(viscous, 
 def test_what_most_logs_gain_does_not_outweigh_one_that_is_ruined(ruined, log):
     """By half as much again, by what matters, and by more than is gained: an error that was small may have grown to one that
     still is."""
-    trials = [
-        SimpleNamespace(log=SimpleNamespace(samples=range(n), path=Path(name)))
-        for n, name in ((900, "cold.log"), (100, "warm.log"))
-    ]
-    model = SimpleNamespace(bench=SimpleNamespace(trials=trials))
+    trials = [SimpleNamespace(log=SimpleNamespace(path=Path(name))) for name in ("cold.log", "warm.log")]
+    rows = [slice(0, 900), slice(900, 1000)]
+    model = SimpleNamespace(bench=SimpleNamespace(trials=trials, rows=rows))
     selection = SimpleNamespace(model=model, screening=SimpleNamespace(floor=lambda model, channel: 10.0))
     of = np.repeat([0, 1], [900, 100])
     before, after = np.array([100.0, 5.0 if ruined < 100.0 else 100.0])[of], np.array([20.0, ruined])[of]

@@ -10,9 +10,10 @@ from diagnosekit import drives, with_late
 from emb_daemon.calibration.parameters import CLEARANCE, CLEARANCE_SIGMA, moved, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose import model as model_module
 from emb_daemon.diagnose import search
 from emb_daemon.diagnose import selection as selection_module
-from emb_daemon.diagnose.coordinates import about_middle, base_coordinates, by_key, effect_coordinates
+from emb_daemon.diagnose.coordinates import HISTORY_TIME, about_middle, base_coordinates, by_key, effect_coordinates
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench, make_trial
@@ -253,6 +254,22 @@ def test_with_heat_held_the_paths_are_those_of_the_step(calibration, moved_rad):
         )
     )
     assert rmse(change - expected) < 0.03 * rmse(expected)
+
+
+def test_regressors_are_those_of_where_the_fit_ended(calibration, monkeypatch):
+    """Of each coordinate over all logs, its own or not, also if the fit began with what an earlier one had left, and when
+    something else has moved since."""
+    logs = [log_of(next(drives(calibration, seed, {}, stops=2))) for seed in (61, 62)]
+    first = Model.of(Bench(logs, calibration)).refined({"stiffness"})
+    # A fit that goes no step ends where it began.
+    monkeypatch.setattr(model_module, "_EVALUATIONS", 1)
+    [conductivity] = [c for c in first.values if c.name == "thermal.pad.conductivity_W_per_mK"]
+    for model in (first.refined({"stiffness"}), first.entered({conductivity: 1.2}).refined({"stiffness"})):
+        for coordinate in model.own("stiffness"):
+            moved = {**model.values, coordinate: model.values[coordinate] + coordinate.step}
+            heat = [None, None] if coordinate.name == HISTORY_TIME else model.heat
+            does = (model.residual["stiffness"] - model.bench.residual_held(moved, "stiffness", heat)) / coordinate.step
+            np.testing.assert_allclose(model.columns[coordinate], does, atol=1e-9 * max(np.abs(does).max(), 1.0))
 
 
 @pytest.mark.parametrize(
