@@ -66,17 +66,17 @@ def test_torque_beyond_friction():
 def test_force_of_torque_alone_settles_on_the_torque_with_friction_for_sigma():
     c = np.zeros(1, PLAUSIBILITY)[0]
     for _ in range(200):
-        force, sigma = force_of_torque_alone(c, 0.4, True, _DT, 4e-5, 8e-6, 0.03)
+        force, sigma = force_of_torque_alone(c, 0.4, True, _DT, 4e-5, 8e-6, 0.03, 0.0)
     assert force == pytest.approx(10_000.0, rel=1e-6)
     assert sigma == pytest.approx((0.03 + 8e-6 * 10_000.0) / 4e-5, rel=1e-4)
-    after, wider = force_of_torque_alone(c, 0.8, True, _DT, 4e-5, 8e-6, 0.03)
+    after, wider = force_of_torque_alone(c, 0.8, True, _DT, 4e-5, 8e-6, 0.03, 0.0)
     share = 1.0 - np.exp(-0.1)
     assert after == pytest.approx(10_000.0 * (1.0 + share))
     variance = (1.0 - share) * share * 0.4**2
     assert wider == pytest.approx(np.hypot(0.03 + 8e-6 * after, np.sqrt(variance)) / 4e-5)
-    assert force_of_torque_alone(c, 99.0, False, _DT, 4e-5, 8e-6, 0.03) == (after, wider), "no current, no news"
+    assert force_of_torque_alone(c, 99.0, False, _DT, 4e-5, 8e-6, 0.03, 0.0) == (after, wider), "no current, no news"
     for _ in range(200):
-        force, sigma = force_of_torque_alone(c, -0.4, True, _DT, 4e-5, 8e-6, 0.03)
+        force, sigma = force_of_torque_alone(c, -0.4, True, _DT, 4e-5, 8e-6, 0.03, 0.0)
     assert force == 0.0 and sigma == pytest.approx(0.03 / 4e-5, rel=1e-3)
 
 

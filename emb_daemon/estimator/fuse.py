@@ -384,12 +384,12 @@ def _torque_alone(s, p, m):
     gain, load friction (m/rad) and offset friction (N m)."""
     slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
     gain, load, coulomb = _gear(s, p, m, s.error, slope)
-    torque = _motor_torque(s, s.error) - gain * spring
-    force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb)
+    torque = _motor_torque(s, s.error)
+    force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb, spring)
     sigma = hypot(sigma, hypot(sqrt(s.covariance[OFFSET, OFFSET]) / gain, p.torque_lasting_sigma * force))
     if slope_unsure > 0.0 or spring_unsure > 0.0:
         sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))
-    return force, sigma, torque, gain, load, coulomb
+    return force, sigma, torque - gain * spring, gain, load, coulomb
 
 
 @njit

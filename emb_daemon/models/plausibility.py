@@ -246,9 +246,10 @@ def count_contradiction(c: Record, ratio: float) -> None:
 
 @njit
 def force_of_torque_alone(
-    c: Record, torque: float, has_current: bool, dt: float, gear_gain: float, load_friction: float, offset_friction: float
-) -> tuple[float, float]:
-    """Clamp force (N) and its standard deviation from motor torque without a resolver.
+    c: Record, torque: float, has_current: bool, dt: float, gear_gain: float, load_friction: float, offset_friction: float,
+    spring: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Clamp force (N) and its standard deviation from motor torque without a resolver, beside the ``spring`` force in N.
 
     The direction of friction and the motor's acceleration are unknown: friction counts in full, and inertia as the torque's
     variation over `_AVERAGED_S`. Must be called with every sample, because it keeps that variation up to date.
@@ -260,6 +261,6 @@ def force_of_torque_alone(
         off = torque - c.torque_mean
         c.torque_mean += share * off
         c.torque_variance = (1.0 - share) * (c.torque_variance + share * off * off)
-    force = max(c.torque_mean / gear_gain, 0.0)
+    force = max(c.torque_mean / gear_gain - spring, 0.0)
     friction = offset_friction + load_friction * force
     return force, sqrt(friction * friction + c.torque_variance) / gear_gain
