@@ -486,6 +486,20 @@ def test_of_what_logs_cannot_tell_apart_what_does_not_hold_is_not_it(coupled, mo
     assert len(tried) == 1 + accepted and len(set(tried)) == len(tried)
 
 
+def test_the_best_of_all_forms_that_gains_too_little_for_its_length_is_no_term(coupled, monkeypatch):
+    """However sure it is: some form always follows a little of what is left, such as how friction turns over."""
+    monkeypatch.setattr(Search, "chance", lambda *_: 0.0)
+    monkeypatch.setattr(Search, "at_another_time", lambda *_: 0.0)
+    monkeypatch.setattr(Screening, "rival", lambda *_: (0.0, ""))
+    monkeypatch.setattr(Screening, "floor", lambda *_, **__: 1.0)
+    enumerated = prospects.enumerate_forms
+    some = lambda *of: [f for f in enumerated(*of) if f.signal == "motor_speed"]  # noqa: E731
+    monkeypatch.setattr(prospects, "enumerate_forms", some)
+    found = grammar._one_more(coupled[0], "torque")
+    [tried] = [c for name, c in found.candidates.items() if name not in coupled[0].candidates]
+    assert tried.gain > 1.0 and tried.reason == grammar._NOT_SHORTER and found.accepted == coupled[0].accepted
+
+
 def test_what_is_as_good_on_the_screen_is_told_apart_by_a_fit(coupled, monkeypatch):
     """A line may gain more, and be chosen by all resampled episodes, at a port and signal that cannot do it in full. Left-out
     episodes say so, as they do of each bootstrap: one that these never choose must not stand for all."""
