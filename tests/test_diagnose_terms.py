@@ -283,11 +283,12 @@ def _prospect(port, signals, numbers, gain, columns=()):
     [
         ("torque_constant", "winding_heat", "odd_power", (True, False)),
         ("torque_constant", "housing_heat", "decay", (False, True)),
+        ("torque_constant", "caliper_temperature", "odd_power", (True, False)),
         ("torque_constant", "current", "even_power", (True, True)),
         ("gear_friction", "winding_heat", "odd_power", (True, True)),
     ],
 )
-def test_the_heat_of_its_own_motor_strengthens_no_magnet(port, signal, shape, physical):
+def test_heat_strengthens_no_magnet(port, signal, shape, physical):
     """A torque constant that seems to grow with it is something else's shadow: no form of it is taken, nor fitted so."""
     forms = [form for form in enumerate_forms({signal: (0.0, 1.0)}, (port,)) if form.shape == shape]
     for form in forms:
