@@ -145,7 +145,11 @@ def test_a_term_is_made_for_what_no_catalogue_holds(calibration, coupled, tmp_pa
     assert term.coefficient * (half / term.scale) ** term.exponent == pytest.approx(8e-5 * half, rel=0.15)
     assert result.before.rmse("fused") > 80.0 and result.after.rmse("fused") < 45.0
     assert result.unexplained is None
-    assert "brake torque" in verdict(result) and "what it does" in page(result)
+    # That nobody knows such an effect is said where it is named, and drawn with the unit of what it follows.
+    told, written = verdict(result), page(result)
+    assert told.startswith("Found for what no known effect explains: a term of brake torque at the stiffness")
+    assert "its cause is not known" in written and r"brake torque \u002f N" in written and "what it does" in written
+    assert ">nan<" not in written
     assert errors(Bench(logs[1:], calibration), loaded).rmse("fused") == result.after.rmse("fused")
 
 
