@@ -322,7 +322,7 @@ def test_a_load_that_grows_against_a_motor_that_holds_turns_its_friction_back(wa
     angle, friction = way * np.minimum(time, 1.0) * 20.0, np.full(len(time), way)
 
     def of(force):
-        return yielding(time, angle, force + noise, friction, np.full(len(time), 400.0))
+        return yielding(angle, force + noise, friction, np.full(len(time), 400.0))
 
     held = 8000.0 + 6000.0 * way * np.minimum(time - 1.0, 0.0)
     swings = of(held - 300.0 * way * np.sin(2.0 * np.pi * np.maximum(time - 1.0, 0.0)))
@@ -331,3 +331,16 @@ def test_a_load_that_grows_against_a_motor_that_holds_turns_its_friction_back(wa
     assert not of(held - 900.0 * way * np.maximum(time - 1.0, 0.0)).any()
     assert not of(held - 300.0 * way * np.sin(2.0 * np.pi * time) * moves).any()
     assert not of(held - 100.0 * way * np.sin(2.0 * np.pi * np.maximum(time - 1.0, 0.0))).any()
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_load_turns_friction_back_however_short_the_stop(way):
+    """Motor that closes (``way`` 1) or opens, stands for a tenth of a second as it comes near its place, and goes on: by less
+    than a resolver tells, friction has turned back there, and turns over again as soon as the motor slides on."""
+    time = 0.004 * np.arange(500)
+    stands = (time >= 1.0) & (time < 1.1)
+    angle = way * 20.0 * np.where(time < 1.0, time, np.maximum(time - 0.1, 1.0))
+    swing = 900.0 * way * np.clip((time - 1.0) / 0.1, 0.0, 1.0)
+    found = yielding(angle, 8000.0 + swing, np.full(len(time), way), np.full(len(time), 300.0))
+    assert found[stands & (time > 1.06)].all() and not found[time < 1.02].any() and not found[time > 1.11].any()
+    assert not yielding(angle, 8000.0 - swing, np.full(len(time), way), np.full(len(time), 300.0)).any()

@@ -79,22 +79,31 @@ def standing(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     return stands[-1.0] | stands[1.0]
 
 
-def yielding(
-    time_s: np.ndarray, angle_rad: np.ndarray, force_N: np.ndarray, friction: np.ndarray, least_N: np.ndarray
-) -> np.ndarray:
-    """Mask of the samples, shape (N,), of a hold in which the load has turned the friction of the gear back by ``least_N`` or
-    more since the motor stopped: by less motion than a resolver tells, as an uneven disc does at each turn.
+def yielding(angle_rad: np.ndarray, force_N: np.ndarray, friction: np.ndarray, least_N: np.ndarray) -> np.ndarray:
+    """Mask of the samples, shape (N,), in which the load has turned the friction of the gear back by ``least_N`` or more since
+    the motor last slid on: by less motion than a resolver tells, as an uneven disc does at each turn.
 
     ``friction``: its state as the angle tells it, -1 to 1; while it opposes closing, a load that grows is what turns it."""
     against = uniform_filter1d(force_N, _NOISE_SAMPLES) * np.where(friction < 0.0, -1.0, 1.0)
-    holds = _holding(time_s, angle_rad) & (force_N > CLAMPED_N)
-    cuts = np.flatnonzero((holds[1:] != holds[:-1]) | (np.signbit(friction[1:]) != np.signbit(friction[:-1]))) + 1
-    result = np.zeros(len(time_s), np.bool_)
-    for start, stop in pairwise([0, *cuts, len(time_s)]):
-        if holds[start]:
+    clamps = force_N > CLAMPED_N
+    apart = (clamps[1:] != clamps[:-1]) | (np.signbit(friction[1:]) != np.signbit(friction[:-1]))
+    cuts = np.union1d(_slides_on(angle_rad), np.flatnonzero(apart) + 1)
+    result = np.zeros(len(angle_rad), np.bool_)
+    for start, stop in pairwise([0, *cuts.tolist(), len(angle_rad)]):
+        if clamps[start]:
             part = against[start:stop]
             result[start:stop] = np.maximum.accumulate(part - np.minimum.accumulate(part) > least_N[start:stop])
     return result
+
+
+def _slides_on(angle_rad: np.ndarray) -> np.ndarray:
+    """Samples at which the motor has turned on so far since the one before of these that friction has turned over again."""
+    found, last = [], angle_rad[0] if len(angle_rad) else 0.0
+    for index, angle in enumerate(angle_rad.tolist()):
+        if abs(angle - last) >= _HOLDING_RAD:
+            found.append(index)
+            last = angle
+    return np.array(found, np.int64)
 
 
 def _holding(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

@@ -126,9 +126,9 @@ class Form:
         return 1 + (self.shape == "harmonic") + len(self.fitted) + further_numbers(self)
 
     def is_physical(self, coefficient: float) -> bool:
-        """Whether physics allows the coefficient its sign: the heat of its own motor strengthens no magnet."""
+        """Whether physics allows the coefficient its sign: heat strengthens no magnet."""
         strengthens = coefficient > 0.0 if self.shape != "decay" else coefficient < 0.0
-        return not (strengthens and self.port == "torque_constant" and {*self.signals} <= {*_MOTOR_HEAT})
+        return not (strengthens and self.port == "torque_constant" and {*self.signals} <= {*_MOTOR_HEAT, *_TEMPERATURES})
 
     @property
     def step(self) -> float:

@@ -49,6 +49,8 @@ _BOOTSTRAPS = 100
 _RIVAL, _SAME_PORT = 0.05, 0.8
 #: Why a term goes whose gain the fit does not find again.
 _NOT_HELD = "fitted with everything else it no longer holds"
+#: ... and one that is not worth its length.
+_NOT_SHORTER = "these logs are described more shortly without it"
 #: Terms of the heat balance in a calibration.
 _OF_HEAT = 2
 #: Ports and signals that are fitted where a small step does not tell.
@@ -298,8 +300,10 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     at_port = sum(share for (port, _), share in shares.items() if port == prospect.form.port)
     sure = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[prospect.means]:.0f} %"
     candidate = found.candidates[_name(prospect.form, selection)]
-    if at_port < _SAME_PORT:
-        return selection.noted([replace(candidate, accepted=False, reason=sure)])
+    # The best of all forms follows a little of whatever is left, surely so where a small cause is left that none of them is.
+    longer = straight and _description(found, channel) > _description(selection, channel)
+    if longer or at_port < _SAME_PORT:
+        return selection.noted([replace(candidate, accepted=False, reason=_NOT_SHORTER if longer else sure)])
     return found.noted([replace(candidate, reason=f"{candidate.reason}; {sure}")])
 
 

@@ -8,7 +8,7 @@ from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.text import NAMES, number, size, title, verdict
 from emb_daemon.diagnose.unexplained import Left
-from emb_daemon.effects.terms import CLAMPED_N
+from emb_daemon.effects.terms import CLAMPED_N, SIGNALS
 from emb_daemon.report.figures import ACCENT, MARKS, MODEL, PALE, Panel, Trace, xy_figure
 from emb_daemon.report.page import Page
 
@@ -104,6 +104,11 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
     section = report.section(
         title(finding).capitalize(), f"{finding.effect.equation}, with {size(finding)}. {finding.reason}."
     )
+    if finding.made:
+        section.text(
+            "No known effect: where it acts and what it follows is what these logs tell, its shape is the one that describes "
+            "them most shortly, and its cause is not known. Outside of what they cover it is a guess."
+        )
     channel, signals = finding.channel, diagnosis.selection.screening.signals
     signal = finding.over if finding.made else signals.get(finding.effect.signal)
     if channel not in FORCE_CHANNELS or signal is None:
@@ -120,7 +125,7 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
         traces.append(Trace(name, *_bin(signal[applied], residual[applied]), style))
     traces.append(Trace("what it does", *_bin(signal[applied], finding.contribution[applied]), MARKS))
     panels = [Panel(f"mean residual of the {NAMES[channel]}", unit, traces)]
-    section.figure(xy_figure(panels, finding.effect.signal.replace("_", " ")), "Mean residual in bins of equal counts.")
+    section.figure(xy_figure(panels, _axis(finding.effect.signal)), "Mean residual in bins of equal counts.")
     for text, share in finding.placebos.items():
         section.text(f"Placebo: with {text} the same term reaches {100 * share:.0f} % of this gain.")
     section.table(
@@ -137,10 +142,10 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
     section.table(
         ["", "left, RMS", least, "unit", "share of before", ""],
         [
-            [NAMES[c], f"{p.rms:.3g}", f"{p.achieved:.3g}", UNITS[c], f"{p.share:.2f}", _where(p)]
+            [NAMES[c], f"{p.rms:.3g}", f"{p.achieved:.3g}" if p.achieved > 0.0 else "–", UNITS[c], f"{p.share:.2f}", _where(p)]
             for c, p in diagnosis.left.items()
         ],
-        "Residual with the contact angle held. No effect of the catalogue explains what is marked; none was invented.",
+        "Residual with the contact angle held. What is marked neither an effect of the catalogue nor a term explains.",
     )
     screening, residual = diagnosis.selection.screening, diagnosis.selection.model.residual
     for channel, left in diagnosis.left.items():
@@ -154,7 +159,7 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
             after = _bin(signal[keep], residual[channel][keep])
             traces = [Trace("before", *before, PALE), Trace("after", *after, MARKS)]
             section.figure(
-                xy_figure([Panel(f"{NAMES[channel]}, mean residual", "N", traces)], strongest.replace("_", " ")),
+                xy_figure([Panel(f"{NAMES[channel]}, mean residual", "N", traces)], _axis(strongest)),
                 f"Strongest dependence of the {NAMES[channel]} residual after the diagnosis.",
             )
         earlier = {d.signal: f"{d.share:.3f}" for d in diagnosis.selection.at_first.get(channel, [])}
@@ -166,6 +171,12 @@ def _left(report: Page, diagnosis: Diagnosis) -> None:
             ],
             f"{NAMES[channel]}: share of the residual's mean square that a smooth function explains on left-out episodes.",
         )
+
+
+def _axis(signal: str) -> str:
+    """A signal with its unit, where it has one."""
+    unit = SIGNALS.get(signal, "1")
+    return signal.replace("_", " ") + (f" / {unit}" if unit != "1" else "")
 
 
 def _where(left: Left) -> str:

@@ -109,7 +109,7 @@ def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, 
     stands = standing(log.time_s, log.samples["angle"])
     friction = run_paths(log.samples, parameters)["friction_mean"]
     level_N = _friction_N(parameters, np.nan_to_num(clamping))
-    yields = yielding(log.time_s, log.samples["angle"], np.nan_to_num(clamping), friction, (1.0 - _TURNED_OVER) * level_N)
+    yields = yielding(log.samples["angle"], np.nan_to_num(clamping), friction, (1.0 - _TURNED_OVER) * level_N)
     return Trial(log, index, force, cut, rows, measured, torque, stands, np.abs(friction) > _TURNED_OVER, yields, mounted)
 
 

@@ -33,12 +33,11 @@ from emb_daemon.offline.score import rmse
 SHADOW = "a shadow of something else"
 #: False discovery rate over the catalogue.
 Q_VALUE = 0.01
-#: A gain matters from this share of the channel's residual, and from this share of the RMS of the reference: two parts in a
-#: thousand of the force is what force sensors of test rigs are good for.
-_RESIDUAL_SHARE, _SIGNAL_SHARE = 0.06, 0.002
-#: A term is held against what lasts of the residual, and matters from this share of that where it is less: on four drives of
-#: simulated brakes with nothing hidden the best of all forms gains 0.07 to 0.12 of it.
-_LASTING_SHARE = 0.2
+#: A gain matters from this share of the channel's residual, or of what lasts of it where that is less, and from this share of
+#: the RMS of the reference: two parts in a thousand of the force is what force sensors of test rigs are good for. On simulated
+#: brakes with nothing hidden the best of all forms gains 0.07 to 0.12 of what lasts (four drives), and the best effect of the
+#: catalogue that chance does not explain 0.11 (twelve).
+_RESIDUAL_SHARE, _LASTING_SHARE, _SIGNAL_SHARE = 0.06, 0.2, 0.002
 #: Samples in the shortest means, which leave out where friction turns over. How it does is a guess of every model: where it
 #: turns over late it looks like a friction that rises with speed.
 _SLIDING = 2
@@ -131,13 +130,12 @@ class Screening:
         self._size["brake_torque"] = rmse(braking) if len(braking) else 0.0
 
     def floor(self, model: Model, channel: str, made: bool = False) -> float:
-        """Least RMS of an effect that matters, or of a term that is ``made``, in the channel's unit."""
+        """Least RMS of an effect that matters, or of the heat balance of a term that is ``made``, in the channel's unit."""
         if channel == "temperature":
             return _MADE_K if made else _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
-        left = _RESIDUAL_SHARE * np.sqrt(model.noise(channel))
-        if made:
-            left = min(left, _LASTING_SHARE * np.sqrt(model.lasting(channel, LASTING[channel])))
+        lasting = _LASTING_SHARE * np.sqrt(model.lasting(channel, LASTING[channel]))
+        left = min(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), lasting)
         return float(max(left, share * self._size[channel]))
 
     def achieved(self, model: Model, channel: str, force_N: np.ndarray, rise_K: np.ndarray, samples: int = 1) -> float:

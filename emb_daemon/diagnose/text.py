@@ -87,11 +87,14 @@ def verdict(diagnosis: Diagnosis) -> str:
     change = f"error {before:.1f} N → {after:.1f} N {where}"
     if not diagnosis.bench.has_current:
         change += "; no motor current was recorded, so the stiffness path alone was diagnosed"
-    found = [_told(f) for f in diagnosis.accepted if not f.in_calibration]
+    found = [_told(f) for f in diagnosis.accepted if not f.in_calibration and not f.made]
+    made = [_told(f) for f in diagnosis.accepted if f.made]
     changed = [_told(f) for f in diagnosis.accepted if f.in_calibration]
     sentences = [f"Found: {' and '.join(found)}"] if found else []
+    if made:
+        sentences.append(f"{'for' if found else 'Found for'} what no known effect explains: {' and '.join(made)}")
     if changed:
-        sentences.append(f"{'n' if found else 'N'}ot as calibrated: {' and '.join(changed)}")
+        sentences.append(f"{'n' if sentences else 'N'}ot as calibrated: {' and '.join(changed)}")
     if not sentences:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
