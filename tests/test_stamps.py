@@ -180,12 +180,12 @@ def test_of_times_that_cannot_be_nothing_else_is_said(truth, tmp_path, capsys):
 
 @pytest.mark.parametrize("rate_Hz", [250.0, 500.0, 1000.0])
 def test_a_counter_or_milliseconds_taken_for_seconds_are_asked_for(truth, tmp_path, capsys, rate_Hz):
-    """A row each second is no time that cannot be, but too rare for a motor that moves; a rare row at other times asks for nothing."""
+    """A row each second could be, but is too rare for a motor that moves; one at other times is no counter's."""
     columns = foreignkit.sampled(truth, rate_Hz)
     counted = columns | {"time_s": 7000.0 + np.arange(len(columns["time_s"]))}
     _read(tmp_path, counted)
     said = capsys.readouterr().err
-    assert "Or are they a counter's? Then `rate_Hz`" in said and "by the gear's ratio" not in said
+    assert "or a counter's? Then `rate_Hz`" in said and "by the gear's ratio" not in said
     mapping = foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, rate_Hz: {rate_Hz:g}}}")
     _read(tmp_path, counted, mapping)
     assert "rate_Hz" not in capsys.readouterr().err

@@ -590,7 +590,7 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
     line = f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: {why}"
     seconds = 1e-9 * (angle.time_ns - angle.time_ns[0])
     if np.all(np.abs(seconds - np.rint(seconds)) < _WHOLE_S):
-        line += "; its times are whole seconds: is the unit of time right? Or are they a counter's? Then `rate_Hz`, counts a second"
+        line += "; its times are whole seconds: another unit of time, or a counter's? Then `rate_Hz`, its counts a second"
     return [line]
 
 
