@@ -182,7 +182,8 @@ def test_of_times_that_cannot_be_nothing_else_is_said(truth, tmp_path, capsys):
 def test_a_counter_or_milliseconds_taken_for_seconds_are_asked_for(truth, tmp_path, capsys, rate_Hz):
     """A row each second could be, but is too rare for a motor that moves; one at other times is no counter's."""
     columns = foreignkit.sampled(truth, rate_Hz)
-    counted = columns | {"time_s": 7000.0 + np.arange(len(columns["time_s"]))}
+    slow = {name: 0.2 * columns[name] for name in ("angle_rad", "speed_rad_per_s")}
+    counted = columns | slow | {"time_s": 7000.0 + np.arange(len(columns["time_s"]))}
     _read(tmp_path, counted)
     said = capsys.readouterr().err
     assert "or a counter's? Then `rate_Hz`" in said and "by the gear's ratio" not in said
