@@ -170,6 +170,31 @@ def test_times_that_cannot_be_are_refused(truth, tmp_path, time_s, said):
     assert said in str(caught.value) and str(caught.value).startswith(f"{tmp_path / 'a.parquet'}: ")
 
 
+def test_of_times_that_cannot_be_nothing_else_is_said(truth, tmp_path, capsys):
+    """Slow motion, late signals and gaps of minutes are then its consequence, and the gear's ratio no remedy."""
+    columns = foreignkit.sampled(truth, 250.0)
+    with pytest.raises(InputError):
+        _read(tmp_path, columns | {"time_s": 1e3 * columns["time_s"]})
+    assert " FL: " not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rate_Hz", [250.0, 500.0, 1000.0])
+def test_a_counter_or_milliseconds_taken_for_seconds_are_asked_for(truth, tmp_path, capsys, rate_Hz):
+    """A row each second could be, but is too rare for a motor that moves; one at other times is no counter's."""
+    columns = foreignkit.sampled(truth, rate_Hz)
+    slow = {name: 0.2 * columns[name] for name in ("angle_rad", "speed_rad_per_s")}
+    counted = columns | slow | {"time_s": 7000.0 + np.arange(len(columns["time_s"]))}
+    _read(tmp_path, counted)
+    said = capsys.readouterr().err
+    assert "or a counter's? Then `rate_Hz`" in said and "by the gear's ratio" not in said
+    mapping = foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, rate_Hz: {rate_Hz:g}}}")
+    _read(tmp_path, counted, mapping)
+    assert "rate_Hz" not in capsys.readouterr().err
+    _read(tmp_path, {name: values[:: int(rate_Hz / 7)] for name, values in columns.items()})
+    said = capsys.readouterr().err
+    assert "too rare" in said and "rate_Hz" not in said
+
+
 def test_a_clock_that_is_set_while_recording_costs_no_memory(truth, tmp_path):
     """The first stamp of a computer whose clock was not yet set, in a log of another rate than ours."""
     columns = foreignkit.sampled(truth, 500.0)
@@ -566,6 +591,17 @@ def test_counts_that_were_mapped_as_another_unit_are_counts(tmp_path, capsys, un
     mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS).replace("angle_rad, unit: rad", f"angle_rad, unit: {unit}")
     _read(tmp_path, columns | {"angle_rad": np.rint(5e4 * columns["angle_rad"])}, mapping)
     assert "counts of an encoder? Then `unit: rev`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("unit", "is_asked"), [("rad", True), ("rev", True), ("deg", False)])
+def test_counts_of_a_joint_that_turns_slowly_are_counts(tmp_path, capsys, unit, is_asked):
+    """No angle has steps of a radian or a turn; whole degrees are a coarse sensor's, or a servo's."""
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    way = 40.0 * np.sin(np.linspace(0.0, 30.0, len(columns["time_s"])))
+    mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS).replace("angle_rad, unit: rad", f"angle_rad, unit: {unit}")
+    for angle, is_whole in ((np.rint(way), is_asked), (way, False), (np.rint(way / 30.0), False)):
+        _read(tmp_path, columns | {"angle_rad": angle}, mapping)
+        assert ("counts of an encoder? Then `unit: rev`" in capsys.readouterr().err) == is_whole
 
 
 @pytest.mark.parametrize("rate_Hz", [50.0, 250.0])

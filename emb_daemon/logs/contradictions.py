@@ -41,6 +41,8 @@ _FASTEST, _SELDOM, _STEPS = 655.0, 0.01, 5
 _DEGREE, _TURN = np.pi / 180.0, 2.0 * np.pi
 #: Fewest counts that an encoder has in a turn, if a power of two.
 _LEAST_COUNTS = 256
+#: Fewest different angles, after the first, of which being whole numbers is no accident.
+_LEAST_STEPS = 20
 #: Largest relative deviation of a jump from a whole turn.
 _ABOUT = 0.1
 #: Least step where a value wraps around, as a share of its range, least number of such steps, and share of those of few
@@ -386,14 +388,17 @@ def _find_late_current(speed: Series, current: Series, force: Series | None) -> 
 
 
 def _find_too_fast(angle: Series) -> list[str]:
-    """A line on an angle that turns faster than any motor, and the unit that it may have."""
+    """A line on an angle that turns faster than any motor, and the unit that it may have; or on whole radians or turns."""
     # Over several samples, because jitter of the stamps makes single steps fast.
     way, took = (column[_STEPS:] - column[:-_STEPS] for column in (angle.values, 1e-9 * angle.time_ns))
     fastest = float(np.quantile(np.abs(way / took), 1.0 - _SELDOM))
+    counts = "its values are whole numbers: counts of an encoder? Then `unit: rev`, and one over those of a turn as `scale`"
     if fastest <= _FASTEST:
-        return []
-    if _are_whole(angle.values):
-        what = "its values are whole numbers: counts of an encoder? Then `unit: rev`, and one over those of a turn as `scale`"
+        # No angle is measured in steps of a radian or a turn; a joint's encoder counts slowly.
+        steps = len(np.unique(angle.values)) - 1
+        return [f"MotorAngle: {counts}"] if steps >= _LEAST_STEPS and _are_whole(angle.values, (1.0, _TURN)) else []
+    if _are_whole(angle.values, (1.0, _DEGREE, _TURN)):
+        what = counts
     elif fastest * _DEGREE <= _FASTEST:
         what = f"if its values are degrees, `unit: deg` makes {fastest * _DEGREE:.3g} rad/s of it"
     else:
@@ -418,16 +423,17 @@ def _find_rounded(corner: str, angle: Series, current: Series | None, bare: bool
         how = f"{how}, of a deflection any that makes radians of it"
         return [f"MotorAngle covers {way:.2g} {lost}: {how}"] if bare and goes else []
     speed = covered("EMB_{}_Resolver", "MotorSpeed", angle.derivative().values)
-    if speed < _LEAST_COVERED:
+    # The speed of samples that are too rare for it is not known.
+    if speed < _LEAST_COVERED and not (angle.course_is_unknown if bare else angle.way_is_unknown):
         lines.append(f"MotorSpeed covers {speed:.2g} {lost}: {how}")
     if current is not None and 0.0 < (steps := covered("EMB_{}_Current", "CurrentQ", current.values)) < _LEAST_COVERED:
         lines.append(f"CurrentQ covers {steps:.2g} {lost}: `scale` it up, and the torque constant down")
     return lines
 
 
-def _are_whole(values: np.ndarray) -> bool:
-    """Whether values are whole numbers, as mapped or of the unit that they were mapped from."""
-    return any(bool(np.all(np.abs(values / unit - np.rint(values / unit)) < 1e-6)) for unit in (1.0, _DEGREE, _TURN))
+def _are_whole(values: np.ndarray, units: tuple[float, ...]) -> bool:
+    """Whether values are whole numbers of one of the units that they may have been mapped from."""
+    return any(bool(np.all(np.abs(values / unit - np.rint(values / unit)) < 1e-6)) for unit in units)
 
 
 def _turn_as(jump: float) -> str:

@@ -48,6 +48,8 @@ _UNUSED = ("CurrentD", "DcBusVoltage")
 _PLATES = ("InnerBackplateTemp", "OuterBackplateTemp")
 #: Sampling periods of a motor angle that a log can have: a test bench's own, and one that would miss whole stops.
 _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
+#: How far rounding of a number as large as an epoch's takes it from a whole second.
+_WHOLE_S = 1e-5
 #: Shortest period that another unit of time is suggested for, s; a day is what spreadsheets count in.
 _USUAL_S, _OF_TIME = 5e-4, ("s", "ms", "us", "ns", "d")
 #: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
@@ -413,6 +415,8 @@ class Mapping:
             if isinstance(angle, Series) and not angle.is_sparse and np.any(stray := strays(angle.values)):
                 tell(f"{path}: {name}: {np.sum(stray)} values of MotorAngle are far from both beside them: left out")
                 signals["MotorAngle"] = Series(angle.time_ns[~stray], angle.values[~stray])
+        # Of times that cannot be, everything else that would be said is a consequence.
+        self._check_rate(path, messages)
         for corner in CORNERS:
             if has_dead_current(corner, messages):
                 del messages[f"EMB_{corner}_Current"]
@@ -422,7 +426,6 @@ class Mapping:
                 )
             for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
                 tell(f"{path}: {corner}: {line}")
-        self._check_rate(path, messages)
         for name in messages:
             if name.endswith("_Resolver") and not self._sources(name):
                 messages[name] = standing(messages, messages[name]["MotorAngle"])
@@ -584,7 +587,11 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
         else f"a clamp takes 200 ms, and {unknown}; the torque path says nothing, and identify needs 10 ms (100 Hz) or a "
         "slower motion"
     )
-    return [f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: {why}"]
+    line = f"one sample of the motor every {1e-6 * angle.period_ns:.3g} ms, too rare for this motion: {why}"
+    seconds = 1e-9 * (angle.time_ns - angle.time_ns[0])
+    if np.all(np.abs(seconds - np.rint(seconds)) < _WHOLE_S):
+        line += "; its times are whole seconds: another unit of time, or a counter's? Then `rate_Hz`, its counts a second"
+    return [line]
 
 
 _BENCH = "of a bench say so by `value: 0` of ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp"
