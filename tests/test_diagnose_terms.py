@@ -505,6 +505,15 @@ def test_the_best_of_all_forms_that_gains_too_little_for_its_length_is_no_term(c
     assert tried.gain > 1.0 and tried.reason == grammar._NOT_SHORTER and found.accepted == coupled[0].accepted
 
 
+@pytest.mark.parametrize("clamps", [True, False])
+def test_only_of_a_brake_a_term_must_shorten_the_description(monkeypatch, clamps):
+    """Where nothing is clamped, terms that lengthen it hold on other recordings."""
+    bench = SimpleNamespace(clamps=clamps)
+    bare, found = (SimpleNamespace(model=SimpleNamespace(bench=bench), accepted=names) for names in ([], ["term"]))
+    monkeypatch.setattr(grammar, "_description", lambda selection, channel: float(len(selection.accepted)))
+    assert grammar._is_longer(found, bare, "torque") == clamps and not grammar._is_longer(bare, found, "torque")
+
+
 def test_what_is_as_good_on_the_screen_is_told_apart_by_a_fit(coupled, monkeypatch):
     """A line may gain more, and be chosen by all resampled episodes, at a port and signal that cannot do it in full. Left-out
     episodes say so, as they do of each bootstrap: one that these never choose must not stand for all."""

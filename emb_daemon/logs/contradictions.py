@@ -108,7 +108,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
             return [*lines, text + _turn_as(jump)]
-        lines += _find_too_fast(angle)
+        lines += _find_angle_unit(angle)
         lines += _find_rounded(corner, angle, current, bare)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
     moves = not (speed is None or current is None or is_unresolved(corner, messages))
@@ -387,8 +387,8 @@ def _find_late_current(speed: Series, current: Series, force: Series | None) -> 
     return [f"{told} Then `mean_ms: {-2 * late_ms}` there"]
 
 
-def _find_too_fast(angle: Series) -> list[str]:
-    """A line on an angle that turns faster than any motor, and the unit that it may have; or on whole radians or turns."""
+def _find_angle_unit(angle: Series) -> list[str]:
+    """A line on an angle that turns faster than any motor, or is whole radians or turns, and the unit that it may have."""
     # Over several samples, because jitter of the stamps makes single steps fast.
     way, took = (column[_STEPS:] - column[:-_STEPS] for column in (angle.values, 1e-9 * angle.time_ns))
     fastest = float(np.quantile(np.abs(way / took), 1.0 - _SELDOM))
