@@ -210,15 +210,15 @@ def test_a_torque_of_one_sample_may_have_just_begun():
     assert not any(said)
 
 
-def _swings(torques, angles=None, presliding_angle=0.02, force=0.0, load=0.0):
+def _swings(torques, angles=None, presliding_angle=0.02, force=0.0, load=0.0, friction_sigma=0.0, load_sigma=0.0):
     """What `hold` makes of smoothed torques (N m) over a force that friction of 0.1 N m and ``load`` m/rad holds."""
     c = np.zeros(1, PLAUSIBILITY)
     stands(c[0], 1.0)
     counted = 0
     for torque, angle in zip(torques, np.ones(len(torques)) if angles is None else angles, strict=True):
-        c["torque_mean"] = torque
+        c["steady"] = torque
         if stands(c[0], angle):
-            counted = hold(c[0], force, 0.01, 4e-5, load, 0.1, presliding_angle)
+            counted = hold(c[0], force, 0.006, 4e-5, load, 0.1, friction_sigma, load_sigma, presliding_angle)
     return counted
 
 
@@ -230,6 +230,12 @@ def test_torque_that_swings_by_more_than_friction_turns_over_within_a_standing_a
     assert _swings([0.0, 0.31, 0.0], presliding_angle=1e-4) == 0 and _swings([0.0, 0.33], presliding_angle=1e-4) == 1
     assert _swings([0.0, 0.165, 0.0, 0.0], [1.0, 1.0, 1.0, 1.006]) == 2
     assert _swings([0.0, 0.165, 0.0, 0.0], [1.0, 1.006, 1.006, 1.006]) == 1, "counted from where the angle moved last"
+
+
+def test_a_swing_is_none_that_unknown_friction_or_an_uneven_disc_may_be():
+    """Of friction 0.79 turns over in both directions; three standard deviations each."""
+    assert _swings([0.0, 0.209], friction_sigma=0.02) == 0 and _swings([0.0, 0.2105], friction_sigma=0.02) == 1
+    assert _swings([0.0, 0.19], load_sigma=0.01) == 0 and _swings([0.0, 0.193], load_sigma=0.01) == 1
 
 
 def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():

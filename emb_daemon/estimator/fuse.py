@@ -50,7 +50,7 @@ from emb_daemon.estimator.status import (
     RESOLVER_IMPLAUSIBLE,
     TORQUE_OLD,
 )
-from emb_daemon.estimator.straying import attribute_straying
+from emb_daemon.estimator.straying import attribute_straying, straying_sigma
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
     SLOW_RAD_PER_S,
@@ -93,7 +93,9 @@ from emb_daemon.models.plausibility import (
     due,
     force_of_torque_alone,
     hold,
+    smoothed_sigma,
     stands,
+    steady,
 )
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
@@ -329,7 +331,7 @@ def fuse(
         # Error of the travel from the released position by a resolver with a wrong gain.
         out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
         # What the zero strays by until torque has shown it.
-        strays = abs(s.wander.rate) * _LASTS_S + abs(s.wander.loss) * _STROKE_S * p.maximum_speed
+        strays = straying_sigma(s, _LASTS_S) + abs(s.wander.loss) * _STROKE_S * p.maximum_speed
         out.sigma = hypot(out.sigma, s.slope * s.gear_slope * strays)
         out.sigma = hypot(out.sigma, common_sigma(s, p) * out.force)
         if s.past_contact <= 0.0:
@@ -393,6 +395,16 @@ def _torque_alone(s, p, m):
 
 
 @njit
+def _standing_sigmas(s, p, m):
+    """Standard deviations (N m) of friction that holds a standing motor, and of what an uneven disc changes the load by."""
+    P, load = s.covariance, max(s.force + s.spring_force, 0.0) * s.gear_slope
+    known = s.gear_friction * (p.offset_friction + p.load_friction * load)
+    friction = P[COULOMB, COULOMB] + sq(load) * P[LOAD, LOAD] + sq(known) * P[SLOW, SLOW]
+    wheel_stands = m.has_wheel_speed and m.wheel_speed <= TURNING_RAD_PER_S
+    return sqrt(friction), 0.0 if wheel_stands else s.slope * uneven.SWING_M
+
+
+@njit
 def _least_beyond_friction(s, p, m, accelerating, spread):
     """`beyond_friction` of the hypothesis that explains the torque best, among those that may explain it; ``accelerating``:
     what accelerates the motor, N m."""
@@ -431,9 +443,14 @@ def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_s
     ``standing_sigma`` N m, as `fuse` returns them."""
     c = s.plausibility
     force, sigma, torque, gain, load, coulomb = _torque_alone(s, p, m)
+    accelerating = p.inertia * (m.speed - s.speed) / m.dt if m.dt > 0.0 else 0.0
     swings = 0
+    if m.has_current:
+        steady(c, _motor_torque(s, s.error), accelerating, m.dt)
     if m.has_current and stands(c, m.angle):
-        swings = hold(c, s.force, standing_sigma, gain, load, coulomb, p.presliding_angle)
+        noise = smoothed_sigma(p.torque_constant * p.current_sigma, p.current_correlation_time)
+        friction_sigma, load_sigma = _standing_sigmas(s, p, m)
+        swings = hold(c, s.force, noise, gain, load, coulomb, friction_sigma, load_sigma, p.presliding_angle)
         # A latch holds the motor against any torque, and the stop of an open brake against one that opens it.
         if m.has_status and m.park_brake == 0.0 and (s.force > 0.0 or torque > 0.0):
             spread = hypot(gain * out.stiffness_sigma, standing_sigma)
@@ -442,7 +459,7 @@ def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_s
                 swings = max(swings, 1)
     if np.isfinite(out.innovation):
         spread = hypot(gain * out.stiffness_sigma, turning_sigma)
-        beyond = _least_beyond_friction(s, p, m, p.inertia * (m.speed - s.speed) / m.dt, spread)
+        beyond = _least_beyond_friction(s, p, m, accelerating, spread)
         count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
     if swings > 1:
         disbelieve_resolver(c)

@@ -213,7 +213,7 @@ def _follow_age(s, p, m, turned, moved_zero):
     else:
         leave_stretch(s.wander)
     if p.clearance_sigma > 0.0:
-        follow_straying(s, travel, m.speed, m.dt)
+        follow_straying(s, travel, turned, m.speed, at_rest(s, m), m.dt)
     if not seen or frozen(s.plausibility):
         interrupt(s.lateness)
         return False
@@ -274,7 +274,7 @@ def _look(s, p, m, facts, out):
         facts |= THERMOCOUPLE_STUCK
     if s.wheel.contradicted:
         facts |= WHEEL_CONTRADICTED
-    if s.wander.found and p.clearance_sigma > 0.0:
+    if (s.wander.found or s.straying.rate != 0.0) and p.clearance_sigma > 0.0:
         facts |= ZERO_WANDERS
     more = excess(s.error, p, m.caliper if s.temperature_known else WARM_C, s.winding, s.housing)
     out.sigma *= more

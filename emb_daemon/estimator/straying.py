@@ -1,9 +1,10 @@
 """A resolver whose zero strays: which share of what its angle gains over its speed moves the contact angle.
 
 `models.wander` finds what the motor angle gains over the integrated speed. The speed's offset may cause that as well as the
-angle; only the torque can tell, because a zero that strays takes the contact angle with it. Stop by stop, what the filter saw
-the contact angle move by is regressed on what had strayed since the last one. The share found so is taken out as it strays,
-and its standard deviation counts in the contact angle's.
+angle. Two things tell: nothing turns the motor of an open brake, so that what moves then is the angle's fault, and what the
+speed shows is its own offset; and a zero that strays takes the contact angle with it, which the torque shows. Stop by stop,
+what the filter saw the contact angle move by is regressed on what had strayed since the last one. The share found so is taken
+out as it strays, and its standard deviation counts in the contact angle's.
 """
 
 from math import exp, sqrt
@@ -13,14 +14,23 @@ import numpy as np
 from emb_daemon.estimator.paths import shift_zero
 from emb_daemon.jit import Record, fields, njit, sq
 from emb_daemon.models.fusion import CONTACT
-from emb_daemon.models.wander import OFFSET_RAD_PER_S
+from emb_daemon.models.wander import COUNTS_RAD, OFFSET_RAD_PER_S, show_unseen, take_offset
+from emb_daemon.wire.contract import CYCLE_S
 
 #: ``share`` of what strays that is the angle's fault, and ``told``: what stops have told of it, as an inverse variance. The
 #: last release left the contact angle at ``contact`` rad with variance ``known`` rad² (0: placed anew since); since then the
 #: zero may have ``strayed`` by so many rad, and the contact angle ``gained`` that variance beside, rad². ``walked``: the
 #: variance that the contact angle gains with the present sample because of what strays, rad². ``speed`` rad/s, smoothed, and
-#: ``creeps``: whether the motor may stand although its angle creeps.
-STRAYING = np.dtype([*fields("f8", "share told strayed contact known gained walked speed"), ("creeps", "?")], align=True)
+#: ``creeps``: whether the motor may stand although its angle creeps. That of an open brake has stood for ``rest_s`` s of late,
+#: in which its angle and its integrated speed changed by ``rest_travel`` and ``rest_turned`` rad; ``rate`` rad/s: at which the
+#: zero then drifted, 0 if that is not certain, and ``drifted`` rad: so far since the last release.
+STRAYING = np.dtype(
+    [
+        *fields("f8", "share told strayed contact known gained walked speed rest_s rest_travel rest_turned rate drifted"),
+        ("creeps", "?"),
+    ],
+    align=True,
+)
 
 #: Inverse variance of the share before a stop has told anything: nothing or all of it.
 _OPEN = 1.0 / 0.5**2
@@ -29,6 +39,11 @@ _KEPT = 0.9
 #: Time over which the speed is smoothed, s; of a motor that stands it is at most the speed's offset and so many standard
 #: deviations of its noise, then as now.
 _SMOOTHED_S, _NOISE = 0.2, 3.0
+#: Time for which a motor must stand to tell, s: the noise of the speed then leaves a drift of some hundredths of a rad/s; and
+#: standard deviations of that which what strays must reach to tell whose fault it is.
+_REST_S, _SHOWN = 2.0, 3.0
+#: Share by which a drift may change until the motor stands again.
+_CHANGES = 0.1
 
 
 @njit
@@ -37,19 +52,62 @@ def _variance(a):
 
 
 @njit
-def follow_straying(s: Record, travel: float, speed: float, dt: float) -> None:
-    """Take out what the zero strays by in ``dt`` s, in which the angle moves by ``travel`` rad, at the ``speed`` rad/s."""
+def straying_sigma(s: Record, seconds: float) -> float:
+    """Standard deviation of what the zero strays by in so many seconds with the share that is not known of it, rad."""
+    return sqrt(_variance(s.straying)) * abs(s.wander.rate) * seconds
+
+
+@njit
+def follow_straying(s: Record, travel: float, turned: float, speed: float, open_brake: bool, dt: float) -> None:
+    """Take out what the zero strays by in ``dt`` s, in which the angle moves by ``travel`` rad and the integrated speed by
+    ``turned`` rad, at the ``speed`` rad/s; ``open_brake``: whether nothing turns the motor."""
     a, w = s.straying, s.wander
+    if open_brake and a.creeps:
+        _rest(s, travel, turned, dt)
     strays = w.drift * dt + w.loss * abs(travel)
     a.strayed += strays
-    shift_zero(s, a.share * strays)
+    drifts = a.rate * dt
+    a.drifted += drifts
+    shift_zero(s, drifts if drifts != 0.0 else a.share * strays)
     # The share is the same all the time, so that its error adds up.
-    a.walked = (max(2.0 * _variance(a) * a.strayed * strays, 0.0) + w.unseen * w.unseen) * sq(s.gear_slope)
+    variance = 2.0 * sq(_CHANGES) * a.drifted * drifts if drifts != 0.0 else 2.0 * _variance(a) * a.strayed * strays
+    a.walked = (max(variance, 0.0) + w.unseen * w.unseen) * sq(s.gear_slope)
     w.unseen = 0.0
     # What is certainly motion counts as just that: a fast stroke would otherwise be remembered for a second.
     most, noise = OFFSET_RAD_PER_S + _NOISE * s.speed_sigma, s.speed_sigma * sqrt(0.5 * dt / _SMOOTHED_S)
     a.speed += (1.0 - exp(-dt / _SMOOTHED_S)) * (min(max(speed, -most), most) - a.speed)
     a.creeps = abs(speed) < most and abs(a.speed) < OFFSET_RAD_PER_S + _NOISE * noise
+
+
+@njit
+def _rest(s, travel, turned, dt):
+    """Take one sample of a motor that stands."""
+    a = s.straying
+    a.rest_s += dt
+    a.rest_travel += travel
+    a.rest_turned += turned
+    if a.rest_s < _REST_S:
+        return
+    slip, variance = a.rest_travel - a.rest_turned, sq(s.speed_sigma) * CYCLE_S * a.rest_s + sq(COUNTS_RAD)
+    known, a.rate = a.rate != 0.0, 0.0
+    # Where both show the same, the motor may creep after all.
+    if abs(slip) >= abs(a.rest_turned):
+        take_offset(s.wander, a.rest_turned, variance, a.rest_s)
+        if slip * slip > sq(_SHOWN) * variance:
+            _learn_share(a, slip, a.rest_travel, variance)
+            if a.rest_travel / slip > 0.5:
+                a.rate = a.rest_travel / a.rest_s
+    if a.rate != 0.0 and not known:
+        show_unseen(s.wander)
+    a.rest_s = a.rest_travel = a.rest_turned = 0.0
+
+
+@njit
+def _learn_share(a, strayed, moved, variance):
+    """What has ``strayed`` by so many rad of the angle has moved its zero by ``moved`` rad, with that variance."""
+    known = _variance(a) * strayed
+    a.share = min(max(a.share + known * (moved - a.share * strayed) / (known * strayed + variance), 0.0), 1.0)
+    a.told += strayed * strayed / variance
 
 
 @njit
@@ -62,7 +120,7 @@ def attribute_straying(s: Record) -> None:
         # What the stop alone has told of the contact angle, and how well.
         whole = predicted / (predicted - known)
         moved, told = (contact - a.contact) * whole, known * whole
-        a.share = min(max(a.share + _variance(a) * strayed * moved / (predicted + told), 0.0), 1.0)
-        a.told += strayed * strayed / (walked + told)
+        _learn_share(a, strayed, a.share * strayed + moved, walked + told)
     a.told *= _KEPT
     a.contact, a.known, a.strayed, a.gained = contact, known, 0.0, 0.0
+    a.drifted = 0.0

@@ -22,6 +22,8 @@ STATES = 2 * ORDERS
 #: Standard deviation of cosine and sine of order 1, m: 10 to 20 um from crest to trough before drivers complain (Jacobsson,
 #: Aspects of disc brake judder, Proc. IMechE D 217, 2003); amplitudes of a smooth disc fall with the square of the order.
 _AMPLITUDE_M = 7e-6
+#: That of the difference between the thicknesses at two moments, m: crest and trough of cosine and sine.
+SWING_M = 2.0 * _AMPLITUDE_M
 #: Time of braking in which wear changes the disc's shape, s.
 _WORN_S = 3600.0
 #: Log odds of a disc that its calibration does not know: one in 55. Of an even disc they rise by k with a probability of at

@@ -16,18 +16,18 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import Record, fields, njit
+from emb_daemon.jit import Record, fields, hypot, njit
 
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in
 #: which angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
-#: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one. The angle has stood at
-#: ``held_angle`` (rad) for ``held`` samples; meanwhile the torque swung ``swings`` times, the last time upwards (``swing`` 1)
-#: or downwards (-1); ``held_low``, ``held_high``: its least and largest value since the last swing. ``pinned``: samples in a
-#: row in which the current repeated to the bit while the motor turned; ``limit`` A: of either sign, as far as its sensor then
-#: goes, 0 if unknown. ``due_acceleration`` (rad/s²), ``due_speed`` (rad/s), ``due_angle`` (rad): motion that the torque must
-#: have caused since the angle stands.
+#: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``steady``: the same less what
+#: accelerates the motor. The angle has stood at ``held_angle`` (rad) for ``held`` samples; meanwhile ``steady`` swung
+#: ``swings`` times, the last time upwards (``swing`` 1) or downwards (-1); ``held_low``, ``held_high``: its least and largest
+#: value since the last swing. ``pinned``: samples in a row in which the current repeated to the bit while the motor turned;
+#: ``limit`` A: of either sign, as far as its sensor then goes, 0 if unknown. ``due_acceleration`` (rad/s²), ``due_speed``
+#: (rad/s), ``due_angle`` (rad): motion that the torque must have caused since the angle stands.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -36,7 +36,7 @@ PLAUSIBILITY = np.dtype(
         *fields("i8", "still idle alike flickered current_flickered"),
         *fields("f8", "current frozen_s"),
         ("averaged", "?"),
-        *fields("f8", "torque_mean torque_variance held_angle held_low held_high due_acceleration due_speed due_angle"),
+        *fields("f8", "torque_mean torque_variance steady held_angle held_low held_high due_acceleration due_speed due_angle"),
         *fields("i8", "held swing swings pinned"),
         ("limit", "f8"),
     ],
@@ -65,8 +65,9 @@ _COMPARED_S, _APART_RAD, _DELAY_S = 0.1, 0.6, 0.01
 _RETURNED, _ALIKE_RAD = 25, 0.05
 #: Share by which friction at rest may exceed what sliding takes.
 _STICTION = 0.3
-#: Standard deviations of one sample's torque that its mean over `_AVERAGED_S` does not reach.
-_CERTAIN = 6.0
+#: Standard deviations of a smoothed torque that it does not swing by in an hour, one hold in 2000; and of what is the same all
+#: the time, or all the turn of a disc.
+_CERTAIN, _SURELY = 10.0, 3.0
 #: Change below which an angle counts as standing, rad: three counts of a resolver of 12 bit; and factor on the share of
 #: friction that may turn over within it, over the calibration's.
 _STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
@@ -175,12 +176,19 @@ def beyond_friction(
 
 
 @njit
+def steady(c: Record, torque: float, accelerating: float, dt: float) -> None:
+    """Smooth the motor's ``torque`` less what is ``accelerating`` it, N m. Its mean alone goes on to rise for a while when the
+    motor stops."""
+    c.steady += (1.0 - exp(-dt / _AVERAGED_S)) * (torque - accelerating - c.steady)
+
+
+@njit
 def stands(c: Record, angle: float) -> bool:
     """Whether the motor angle ``angle``, rad, stands."""
     if abs(angle - c.held_angle) <= _STANDS_RAD:
         c.held += 1
         return True
-    c.held_angle, c.held_low, c.held_high = angle, c.torque_mean, c.torque_mean
+    c.held_angle, c.held_low, c.held_high = angle, c.steady, c.steady
     c.held = c.swing = c.swings = 0
     c.due_acceleration = c.due_speed = c.due_angle = 0.0
     return False
@@ -189,21 +197,23 @@ def stands(c: Record, angle: float) -> bool:
 @njit
 def hold(
     c: Record, force: float, sigma: float, gear_gain: float, load_friction: float, offset_friction: float,
-    presliding_angle: float,
+    friction_sigma: float, load_sigma: float, presliding_angle: float,
 ) -> int:  # fmt: skip
     """How often the motor must have turned although the angle stands: number of times that the smoothed torque rose or fell by
     more than friction at rest carries in both directions under a clamp force of ``force`` N, as far as friction turns over
     within that angle. A single swing may be an offset of the current, a swing back cannot.
 
-    ``sigma``: standard deviation of the torque, N m; ``presliding_angle`` rad."""
-    c.held_low, c.held_high = min(c.held_low, c.torque_mean), max(c.held_high, c.torque_mean)
+    Standard deviations, N m: ``sigma`` of the smoothed torque by its noise, ``friction_sigma`` of the friction, ``load_sigma``
+    of what the load changes by while the motor stands; ``presliding_angle`` rad."""
+    c.held_low, c.held_high = min(c.held_low, c.steady), max(c.held_high, c.steady)
     carried = (1.0 + _STICTION) * (offset_friction + load_friction * max(force, c.held_high / gear_gain))
     turned_over = 1.0 - exp(-_PRESLIDING_TURNS * _STANDS_RAD / presliding_angle)
-    if c.held_high - c.held_low > 2.0 * turned_over * carried + _CERTAIN * sigma:
-        way = 1 if c.torque_mean > 0.5 * (c.held_low + c.held_high) else -1
+    lasting = hypot(2.0 * turned_over * friction_sigma, load_sigma)
+    if c.held_high - c.held_low > 2.0 * turned_over * carried + _SURELY * lasting + _CERTAIN * sigma:
+        way = 1 if c.steady > 0.5 * (c.held_low + c.held_high) else -1
         c.swings += way != c.swing
         c.swing = way
-        c.held_low = c.held_high = c.torque_mean
+        c.held_low = c.held_high = c.steady
     return c.swings
 
 
@@ -242,6 +252,13 @@ def count_contradiction(c: Record, ratio: float) -> None:
     if np.isfinite(ratio):
         total = max(c.contradiction + min(ratio * ratio, _COUNTED) - _TOLERATED, 0.0)
         c.contradiction = min(total, 1.5 * _UNCONFIRMED * _RAISE)
+
+
+@njit
+def smoothed_sigma(sigma: float, correlation_time: float) -> float:
+    """Standard deviation of the smoothed torque by first-order noise of a standard deviation of ``sigma`` and of
+    ``correlation_time`` s."""
+    return sigma * sqrt(correlation_time / (correlation_time + _AVERAGED_S))
 
 
 @njit

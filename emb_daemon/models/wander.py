@@ -49,7 +49,7 @@ _POSSIBLE = np.array([1.0 / 0.02**2, 1.0 / 0.01**2, 1.0 / 1.0**2, 1.0 / 0.1**2])
 #: Noise of a stretch beside the speed's: two counts of a 12-bit resolver, rad; and share of the way that the trapezoidal
 #: rule misses. A step a of the acceleration at the share x of a cycle T leaves a T² (x (1 - x) - 1/6) / 2, whose standard
 #: deviation is 0.037 a T²: four steps of 8000 rad/s² in a stroke of 10 rad make a thousandth of it.
-_COUNTS_RAD, _MISSED = 0.003, 0.001
+COUNTS_RAD, _MISSED = 0.003, 0.001
 #: Offset of a healthy resolver's speed when nothing is known of it, rad/s, standard deviation: one count of the wire, which a
 #: speed that is cut off instead of rounded is off by, and a tenth of its noise. It shows as a drift that was always there, and
 #: is learned from what differs from it by less than so many standard deviations. Time in which it becomes another, s.
@@ -75,6 +75,21 @@ def watch_wander(a: Record, travel: float, turned: float, speed: float, gained: 
 
 
 @njit
+def take_offset(a: Record, turned: float, variance: float, seconds: float) -> None:
+    """A motor that stood for ``seconds`` has ``turned`` by so many rad, with the variance ``variance`` rad², if its speed is
+    asked: this is the speed's offset."""
+    weight = seconds * seconds / variance
+    a.offset_weight += weight
+    a.offset_sum -= weight * turned / seconds
+
+
+@njit
+def show_unseen(a: Record) -> None:
+    """It was found that something strays: what had strayed was not seen yet."""
+    a.unseen, a.strayed = a.strayed, 0.0
+
+
+@njit
 def leave_stretch(a: Record) -> None:
     """Begin a new stretch, also after a missing sample."""
     a.seconds = a.slip = a.net = a.way = a.gained = 0.0
@@ -94,7 +109,7 @@ def forget_wander(a: Record) -> None:
 
 @njit
 def _take_stretch(a, noise):
-    variance = noise * noise * CYCLE_S * a.seconds + _COUNTS_RAD * _COUNTS_RAD + sq(_MISSED * a.way)
+    variance = noise * noise * CYCLE_S * a.seconds + COUNTS_RAD * COUNTS_RAD + sq(_MISSED * a.way)
     keep = exp(-a.seconds / _KEPT_S)
     causes = a.half
     causes[_RATE], causes[_LOSS], causes[_GAIN], causes[_AGE] = a.seconds, a.way, a.net, a.gained
@@ -116,7 +131,7 @@ def _take_stretch(a, noise):
     a.loss = loss if abs(loss) > _LIKELY * loss_sigma else 0.0
     was, a.found = a.found, abs(apart) > _SURELY * apart_sigma or abs(loss) > _SURELY * loss_sigma
     if a.found and not was:
-        a.unseen, a.strayed = a.strayed, 0.0
+        show_unseen(a)
     if abs(apart) < _LIKE_BEFORE * apart_sigma:
         # The estimate of the rate renews itself in `_KEPT_S`, so it counts once in that time.
         weight = a.seconds / (_KEPT_S * rate_sigma * rate_sigma)
