@@ -92,7 +92,8 @@ STATE = np.dtype(
 @njit
 def _follow(signal, s, m):
     """Signals at this sample. Its force is not known yet: the last one is moved along the curve's slope."""
-    signal[_ANGLE], signal[_TRAVEL], signal[_SPEED] = m.angle + s.ahead, max(s.past_contact + s.travel, 0.0), m.speed
+    signal[_ANGLE], signal[_SPEED] = m.angle + s.ahead - s.zero_moved, m.speed
+    signal[_TRAVEL] = max(s.past_contact + s.travel, 0.0)
     force = max(s.force + s.slope * s.travel, 0.0)
     signal[_FORCE], signal[_RATE] = force, s.slope * m.speed
     signal[_CURRENT] = m.current_q if m.has_current else np.nan

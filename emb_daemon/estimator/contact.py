@@ -91,7 +91,7 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     if abs(behind) > unsure and s.plausibility.still == 0 and not repeats:
         moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
     elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN and not repeats:
-        moved, sigma = jump, reach
+        moved, sigma = (slip, _ZERO_RAD) if seen else (jump, reach)
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure and not repeats:
         moved, sigma = slip, _ZERO_RAD
     elif seen:

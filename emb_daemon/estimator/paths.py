@@ -172,14 +172,21 @@ def _stand(s, m):
 
 @njit
 def shift_zero(s: Record, moved: float) -> None:
-    """Refer all stored angles to a zero that has moved by ``moved`` rad."""
+    """Refer all stored angles to a zero that has moved by ``moved`` rad since the last sample."""
     s.angle += moved
     s.angle_before += moved
     s.slid_angle += moved
+    shift_places(s, moved)
+
+
+@njit
+def shift_places(s: Record, moved: float) -> None:
+    """Refer where contact, teeth and poles are to a zero that had moved by ``moved`` rad before the last sample."""
     s.contact_angle += moved
     s.contact_anchor += moved
     s.start_angle += moved
     s.gear_zero += moved
+    s.zero_moved += moved
     for i in range(len(s.learned)):
         s.learned[i].contact_angle += moved
 
@@ -261,12 +268,15 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     if age > 0.0:
         mean = friction_since(s.lately, s.friction_state, mean, age, _CERTAINLY * p.speed_sigma, p.presliding_angle)
     s.friction_mean = mean
-    e, state, mean_speed, angle, travel = p.effects, s.effects, 0.5 * (m.speed + s.speed), m.angle + s.ahead, s.travel
+    read = m.angle + s.ahead
+    # Teeth and poles stay where they are when the resolver's zero moves.
+    angle = read - s.zero_moved
+    e, state, mean_speed, travel = p.effects, s.effects, 0.5 * (m.speed + s.speed), s.travel
     s.gear_gain = effects.gear_gain(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     s.gear_friction = effects.gear_friction(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
     s.motor_torque = p.torque_constant * m.current_q
     # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
-    middle, slope = turned(s, p, angle - 0.5 * travel)
+    middle, slope = turned(s, p, read - 0.5 * travel)
     s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
     leverage = (p.gear_gain * s.gear_gain + p.load_friction * s.gear_friction * mean) * slope
     if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain * slope:

@@ -125,9 +125,10 @@ STATE = np.dtype(
         # Age of the angle beside the speed, and beyond what the calibration knows, s.
         ("lateness", LATENESS),
         ("late", "f8"),
-        # The motor's speeds of late; way (rad) that it has gone on since its angle was taken, and since the last sample.
+        # The motor's speeds of late; way (rad) that it has gone on since its angle was taken, and since the last sample; by
+        # how much (rad) the resolver's zero has moved since the start.
         ("lately", LATELY),
-        *fields("f8", "ahead travel"),
+        *fields("f8", "ahead travel zero_moved"),
         ("alignment", ALIGNMENT),
         ("wander", WANDER),
         # Fusion: the first hypothesis, and the others.

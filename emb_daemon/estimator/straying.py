@@ -11,10 +11,12 @@ from math import exp, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.paths import shift_zero
+from emb_daemon.estimator.paths import shift_places, shift_zero
+from emb_daemon.estimator.rewind import go_back
 from emb_daemon.jit import Record, fields, njit, sq
 from emb_daemon.models.fusion import CONTACT
-from emb_daemon.models.wander import COUNTS_RAD, OFFSET_RAD_PER_S, show_unseen, take_offset
+from emb_daemon.models.lateness import SLOWEST_S
+from emb_daemon.models.wander import COUNTS_RAD, OFFSET_RAD_PER_S, take_offset
 from emb_daemon.wire.contract import CYCLE_S
 
 #: ``share`` of what strays that is the angle's fault, and ``told``: what stops have told of it, as an inverse variance. The
@@ -23,10 +25,12 @@ from emb_daemon.wire.contract import CYCLE_S
 #: variance that the contact angle gains with the present sample because of what strays, rad². ``speed`` rad/s, smoothed, and
 #: ``creeps``: whether the motor may stand although its angle creeps. That of an open brake has stood for ``rest_s`` s of late,
 #: in which its angle and its integrated speed changed by ``rest_travel`` and ``rest_turned`` rad; ``rate`` rad/s: at which the
-#: zero then drifted, 0 if that is not certain, and ``drifted`` rad: so far since the last release.
+#: zero then drifted, 0 if that is not certain, and ``drifted`` rad: so far since the last release. ``lately_…``: time and ways
+#: of the last moments, which count if it goes on to stand.
 STRAYING = np.dtype(
     [
         *fields("f8", "share told strayed contact known gained walked speed rest_s rest_travel rest_turned rate drifted"),
+        *fields("f8", "lately_s lately_travel lately_turned"),
         ("creeps", "?"),
     ],
     align=True,
@@ -42,8 +46,9 @@ _SMOOTHED_S, _NOISE = 0.2, 3.0
 #: Time for which a motor must stand to tell, s: the noise of the speed then leaves a drift of some hundredths of a rad/s; and
 #: standard deviations of that which what strays must reach to tell whose fault it is.
 _REST_S, _SHOWN = 2.0, 3.0
-#: Share by which a drift may change until the motor stands again.
-_CHANGES = 0.1
+#: Share by which a drift may change until the motor stands again; and standard deviation, as a share, of what has strayed
+#: until it was found, because nobody knows when it began.
+_CHANGES, _SINCE = 0.1, 0.3
 
 
 @njit
@@ -58,12 +63,15 @@ def straying_sigma(s: Record, seconds: float) -> float:
 
 
 @njit
-def follow_straying(s: Record, travel: float, turned: float, speed: float, open_brake: bool, dt: float) -> None:
+def follow_straying(s: Record, p: Record, travel: float, turned: float, speed: float, open_brake: bool, dt: float) -> None:
     """Take out what the zero strays by in ``dt`` s, in which the angle moves by ``travel`` rad and the integrated speed by
     ``turned`` rad, at the ``speed`` rad/s; ``open_brake``: whether nothing turns the motor."""
     a, w = s.straying, s.wander
     if open_brake and a.creeps:
-        _rest(s, travel, turned, dt)
+        _rest(s, p, travel, turned, dt)
+    else:
+        # The motor has begun to turn, and a late speed may not have shown it at once.
+        a.lately_s = a.lately_travel = a.lately_turned = 0.0
     strays = w.drift * dt + w.loss * abs(travel)
     a.strayed += strays
     drifts = a.rate * dt
@@ -80,16 +88,22 @@ def follow_straying(s: Record, travel: float, turned: float, speed: float, open_
 
 
 @njit
-def _rest(s, travel, turned, dt):
+def _rest(s, p, travel, turned, dt):
     """Take one sample of a motor that stands."""
     a = s.straying
-    a.rest_s += dt
-    a.rest_travel += travel
-    a.rest_turned += turned
+    a.lately_s += dt
+    a.lately_travel += travel
+    a.lately_turned += turned
+    if a.lately_s < SLOWEST_S:
+        return
+    a.rest_s += a.lately_s
+    a.rest_travel += a.lately_travel
+    a.rest_turned += a.lately_turned
+    a.lately_s = a.lately_travel = a.lately_turned = 0.0
     if a.rest_s < _REST_S:
         return
     slip, variance = a.rest_travel - a.rest_turned, sq(s.speed_sigma) * CYCLE_S * a.rest_s + sq(COUNTS_RAD)
-    known, a.rate = a.rate != 0.0, 0.0
+    known, a.rate = a.rate != 0.0 or s.wander.found, 0.0
     # Where both show the same, the motor may creep after all.
     if abs(slip) >= abs(a.rest_turned):
         take_offset(s.wander, a.rest_turned, variance, a.rest_s)
@@ -98,8 +112,19 @@ def _rest(s, travel, turned, dt):
             if a.rest_travel / slip > 0.5:
                 a.rate = a.rest_travel / a.rest_s
     if a.rate != 0.0 and not known:
-        show_unseen(s.wander)
+        _undo(s, p)
     a.rest_s = a.rest_travel = a.rest_turned = 0.0
+
+
+@njit
+def _undo(s, p):
+    """The zero has drifted for a while: what the stops meanwhile have taught was wrong, and the contact is where it was before
+    beside what has strayed since."""
+    strayed = s.wander.strayed
+    s.wander.strayed = 0.0
+    shift_places(s, strayed)
+    go_back(s, p)
+    s.covariance[CONTACT, CONTACT] += sq(_SINCE * strayed * s.gear_slope)
 
 
 @njit

@@ -84,12 +84,6 @@ def take_offset(a: Record, turned: float, variance: float, seconds: float) -> No
 
 
 @njit
-def show_unseen(a: Record) -> None:
-    """It was found that something strays: what had strayed was not seen yet."""
-    a.unseen, a.strayed = a.strayed, 0.0
-
-
-@njit
 def leave_stretch(a: Record) -> None:
     """Begin a new stretch, also after a missing sample."""
     a.seconds = a.slip = a.net = a.way = a.gained = 0.0
@@ -131,7 +125,7 @@ def _take_stretch(a, noise):
     a.loss = loss if abs(loss) > _LIKELY * loss_sigma else 0.0
     was, a.found = a.found, abs(apart) > _SURELY * apart_sigma or abs(loss) > _SURELY * loss_sigma
     if a.found and not was:
-        show_unseen(a)
+        a.unseen, a.strayed = a.strayed, 0.0
     if abs(apart) < _LIKE_BEFORE * apart_sigma:
         # The estimate of the rate renews itself in `_KEPT_S`, so it counts once in that time.
         weight = a.seconds / (_KEPT_S * rate_sigma * rate_sigma)
