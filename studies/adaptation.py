@@ -51,7 +51,7 @@ def _false_alarms(state, releases, p, contact_sigma, rng):
                 speed = p.speed_sigma * rng.standard_normal()
                 coloured = rho * coloured + sqrt(1.0 - rho * rho) * rng.standard_normal()
                 torque = p.torque_constant * p.current_sigma * coloured - p.inertia * (speed - before) / CYCLE_S + offset
-                watch_closing(state, torque, 0.0, direction, sigma, limit, x + believed, contact_sigma, 0.0, 0.0)
+                watch_closing(state, torque, 0.0, direction, sigma, limit, x + believed, contact_sigma, 0.0, 0.0, True)
                 alarmed |= engaged(state, x + believed, contact_sigma)
                 x += direction * pace * CYCLE_S
                 samples += 1

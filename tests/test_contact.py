@@ -91,9 +91,24 @@ def test_a_clearance_level_that_was_shown_before_the_offset_drifted_raises_no_al
             contact.age_level(c[0], noise**2 if hold else 0.0, noise)
             for _ in range(10 if hold else 80):
                 for torque in rng.normal(offset, noise, 6):
-                    found = contact.watch_closing(c[0], torque, 0.0, 1.0, noise, limit, -5.0, 0.02, offset, 0.1 * noise)
+                    found = contact.watch_closing(c[0], torque, 0.0, 1.0, noise, limit, -5.0, 0.02, offset, 0.1 * noise, True)
                     assert found == contact.NOTHING
-                contact.watch_closing(c[0], offset, 0.0, -1.0, noise, limit, -5.0, 0.02, offset, 0.1 * noise)
+                contact.watch_closing(c[0], offset, 0.0, -1.0, noise, limit, -5.0, 0.02, offset, 0.1 * noise, True)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("offset_A", [1.0, 3.0])
+def test_a_current_that_steps_while_the_motor_of_an_open_brake_stands_is_no_contact(parameters, offset_A, seed):
+    """No force arises without a motion. The contact was placed where the motor stood, and the open brake shown as clamped."""
+    p = brake.ideal(parameters)
+    stop = brake.stops(p, 2, seed)
+    angle = np.concatenate((stop, np.linspace(0.0, 0.3 * p["clearance"], 200), np.full(1000, 0.3 * p["clearance"])))
+    rows, _ = brake.samples(p, np.concatenate((angle, stop + 0.3 * p["clearance"])))
+    rows["current_q"][len(angle) - 500 :] += offset_A
+    estimates = estimate(brake.noisy(rows, p, seed), p)
+    standing = slice(len(angle) - 500, len(angle))
+    assert not np.any(estimates["engaged"][standing])
+    assert np.all(estimates["stiffness_force"][standing] < 50.0)
 
 
 def test_false_alarms_are_rarer_than_one_in_ten_thousand_releases():

@@ -155,6 +155,6 @@ def test_a_torque_where_none_is_believed_says_at_once_that_the_contact_comes_ear
         (0.0, 1.0, 1.0, 1, contact.TOO_EARLY),
     ):
         for _ in range(samples):
-            found = contact.watch_closing(c[0], torque, predicted, 1.0, 0.01, 8.0, x, 0.1, 0.0, 0.01)
+            found = contact.watch_closing(c[0], torque, predicted, 1.0, 0.01, 8.0, x, 0.1, 0.0, 0.01, True)
         assert found == expected and c["engaged"][0] == (expected == contact.TOO_LATE)
         assert (c["rise"][0], c["shortfall"][0], c["agreed"][0]) == (0.0, 0.0, 0)

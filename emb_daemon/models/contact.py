@@ -75,7 +75,7 @@ def engaged(state: Record, x: float, contact_sigma: float) -> bool:
 @njit
 def watch_closing(
     state: Record, torque: float, predicted: float, friction_mean: float, sigma: float, limit: float, x: float,
-    contact_sigma: float, offset: float, offset_sigma: float,
+    contact_sigma: float, offset: float, offset_sigma: float, turns: bool,
 ) -> int:  # fmt: skip
     """Compare torque with belief for one sample.
 
@@ -88,6 +88,7 @@ def watch_closing(
         limit: `threshold`.
         x, contact_sigma: rad past the believed contact angle, and its standard deviation.
         offset, offset_sigma: the filter's offset of ``torque``, N m; used until enough clearance samples have shown it.
+        turns: whether the motor turns. Without that no force arises in the clearance, but an offset.
 
     Returns:
         NOTHING, TOO_LATE or TOO_EARLY: how the believed contact angle is wrong.
@@ -108,7 +109,7 @@ def watch_closing(
         state.samples = min(state.samples + 1.0, _MOST)
         state.level += (torque - state.level) / state.samples
     above, tolerated = torque - predicted - level, _TOLERANCE * predicted + level_sigma
-    if state.samples >= _LEAST or not clear:
+    if (state.samples >= _LEAST and turns) or not clear:
         state.rise = max(0.0, state.rise + (above - tolerated) / sigma - _DRIFT)
     state.shortfall = max(0.0, state.shortfall - (above + tolerated) / sigma - _DRIFT)
     if state.rise > limit:
