@@ -222,20 +222,27 @@ def _swings(torques, angles=None, presliding_angle=0.02, force=0.0, load=0.0, fr
     return counted
 
 
-def test_torque_that_swings_by_more_than_friction_turns_over_within_a_standing_angle():
-    """Of 0.26 N m, twice and by a third more than friction, 1 - exp(-0.5) within half a presliding angle: 0.102; and 0.06."""
-    assert _swings([0.0, 0.161, 0.0]) == 0
-    assert _swings([0.0, 0.165]) == 1
-    assert _swings([0.0, 0.165, 0.0, 0.165]) == 3
-    assert _swings([0.0, 0.31, 0.0], presliding_angle=1e-4) == 0 and _swings([0.0, 0.33], presliding_angle=1e-4) == 1
-    assert _swings([0.0, 0.165, 0.0, 0.0], [1.0, 1.0, 1.0, 1.006]) == 2
-    assert _swings([0.0, 0.165, 0.0, 0.0], [1.0, 1.006, 1.006, 1.006]) == 1, "counted from where the angle moved last"
+def test_torque_that_swings_by_more_than_friction_carries_beside_a_standing_angle():
+    """Twice the dry friction and a third more, 0.26 N m, and ten standard deviations of 0.006 N m."""
+    assert _swings([0.0, 0.315, 0.0]) == 0
+    assert _swings([0.0, 0.325]) == 1
+    assert _swings([0.0, 0.325, 0.0, 0.325]) == 3
+    assert _swings([0.0, 0.325, 0.0, 0.0], [1.0, 1.0, 1.0, 1.006]) == 2
+    assert _swings([0.0, 0.325, 0.0, 0.0], [1.0, 1.006, 1.006, 1.006]) == 1, "counted from where the angle moved last"
+
+
+def test_what_the_load_adds_to_friction_turns_over_with_the_angle():
+    """Of 0.26 N m, 1 - exp(-0.5) within half a presliding angle: 0.102."""
+    loaded = {"force": 2e4, "load": 5e-6}
+    assert _swings([0.0, 0.417], **loaded) == 0 and _swings([0.0, 0.427], **loaded) == 1
+    stiff = loaded | {"presliding_angle": 1e-4}
+    assert _swings([0.0, 0.575], **stiff) == 0 and _swings([0.0, 0.585], **stiff) == 1
 
 
 def test_a_swing_is_none_that_unknown_friction_or_an_uneven_disc_may_be():
-    """Of friction 0.79 turns over in both directions; three standard deviations each."""
-    assert _swings([0.0, 0.209], friction_sigma=0.02) == 0 and _swings([0.0, 0.2105], friction_sigma=0.02) == 1
-    assert _swings([0.0, 0.19], load_sigma=0.01) == 0 and _swings([0.0, 0.193], load_sigma=0.01) == 1
+    """Three standard deviations each, of friction in both directions."""
+    assert _swings([0.0, 0.435], friction_sigma=0.02) == 0 and _swings([0.0, 0.445], friction_sigma=0.02) == 1
+    assert _swings([0.0, 0.345], load_sigma=0.01) == 0 and _swings([0.0, 0.355], load_sigma=0.01) == 1
 
 
 def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():

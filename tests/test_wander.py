@@ -222,3 +222,17 @@ def test_a_count_that_flickers_beside_an_offset_of_the_speed_is_no_drift(p, offs
     estimates, force = _estimated(p, flicker, 1)
     assert np.mean(estimates["reasons"] & r.OUT_OF_RANGE != 0) < 0.001
     assert np.mean(_beyond(estimates, force)) < 0.01
+
+
+def test_what_the_motor_did_while_no_frames_came_is_no_drift(p):
+    """The brake stood open before and after, a little further on."""
+    rows, _ = brake.samples(p, brake.stops(p, 8, 1))
+    rows = brake.noisy(rows, p)
+    still = np.repeat(rows[1:2], 600)
+    still["speed"] = 0.3 * np.random.default_rng(1).standard_normal(600)
+    later = still.copy()
+    later["angle"] += 0.4
+    later["dt"][0] = 30.0
+    still["speed"][-1] = later["speed"][0] = 0.0
+    estimates = estimate(np.concatenate((rows, still, later)), p)
+    assert not np.any(estimates["reasons"][-500:] & r.OUT_OF_RANGE)

@@ -213,7 +213,7 @@ def _follow_age(s, p, m, turned, moved_zero):
     else:
         leave_stretch(s.wander)
     if p.clearance_sigma > 0.0:
-        follow_straying(s, p, travel, turned, m.speed, at_rest(s, m), m.dt)
+        follow_straying(s, p, travel, turned, m.speed, seen and at_rest(s, m), m.dt)
     if not seen or frozen(s.plausibility):
         interrupt(s.lateness)
         return False

@@ -206,10 +206,12 @@ def hold(
     Standard deviations, N m: ``sigma`` of the smoothed torque by its noise, ``friction_sigma`` of the friction, ``load_sigma``
     of what the load changes by while the motor stands; ``presliding_angle`` rad."""
     c.held_low, c.held_high = min(c.held_low, c.steady), max(c.held_high, c.steady)
-    carried = (1.0 + _STICTION) * (offset_friction + load_friction * max(force, c.held_high / gear_gain))
     turned_over = 1.0 - exp(-_PRESLIDING_TURNS * _STANDS_RAD / presliding_angle)
-    lasting = hypot(2.0 * turned_over * friction_sigma, load_sigma)
-    if c.held_high - c.held_low > 2.0 * turned_over * carried + _SURELY * lasting + _CERTAIN * sigma:
+    # Seals and bearings stick as they like; what the load adds turns over with the angle.
+    loaded = turned_over * load_friction * max(force, c.held_high / gear_gain)
+    carried = 2.0 * (1.0 + _STICTION) * (offset_friction + loaded)
+    lasting = hypot(2.0 * friction_sigma, load_sigma)
+    if c.held_high - c.held_low > carried + _SURELY * lasting + _CERTAIN * sigma:
         way = 1 if c.steady > 0.5 * (c.held_low + c.held_high) else -1
         c.swings += way != c.swing
         c.swing = way
