@@ -86,10 +86,8 @@ def _with_gaps(table: Table) -> Table:
 
 
 def _with_repeats(table: Table) -> Table:
-    again = np.flatnonzero(_random().random(len(table["time"])) < _REPEATS)
-    time = table["time"].copy()
-    time[again[again > 0]] = time[again[again > 0] - 1]
-    return table | {"time": time}
+    again = _random().random(len(table["time"])) < _REPEATS
+    return table | {"time": np.maximum.accumulate(np.where(again, table["time"][0], table["time"]))}
 
 
 def _random() -> np.random.Generator:
@@ -145,7 +143,9 @@ def plain(path: Path) -> Table:
     """Columns of a log, the time in s."""
     log = load_log(path)
     samples = log.samples
-    found = {"angle": samples["angle"], "speed": samples["speed"], "current": samples["current_q"], "force": log.force_N}
+    # A sample without a current of its own carries the last one.
+    current = np.where(samples["has_current"], samples["current_q"], np.nan)
+    found = {"angle": samples["angle"], "speed": samples["speed"], "current": current, "force": log.force_N}
     return {"time": log.time_s, **found}
 
 
@@ -157,7 +157,7 @@ def convert(log: Path, way: Rewritten, folder: Path, mapped: bool = True) -> tup
     """
     folder.mkdir(parents=True, exist_ok=True)
     before = plain(log)
-    there = {name for name in COLUMNS if way.signals.get(name, {}) is not None and np.any(before[name])}
+    there = {name for name in COLUMNS if way.signals.get(name, {}) is not None and np.nan_to_num(before[name]).any()}
     table = {name: values for name, values in way.rewrite(before).items() if name in {"time", *there}}
     path, mapping, result = folder / f"{log.stem}.csv", folder / "mapping.yaml", folder / log.name
     lines = [way.separator.join(table)]

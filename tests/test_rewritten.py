@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from emb_daemon.calibration.files import load_calibration
+from emb_daemon.logs.columns import Decoder
+from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
 from emb_daemon.plant import scenarios as sc
@@ -41,6 +43,16 @@ def test_with_its_mapping_it_is_what_it_was(recording, tmp_path, name):
         theirs, ours = there[column][middle], np.roll(plain[column], lag)[middle]
         turned = np.median(theirs - ours) if column == "angle" else 0.0
         assert np.quantile(np.abs(theirs - ours - turned), 0.95) < limit, column
+
+
+def test_a_current_that_was_not_measured_is_not_written(recording, tmp_path):
+    frames = read_frames(recording)
+    seconds = 1e-9 * (frames["time_ns"] - frames["time_ns"][0])
+    unknown = (frames["can_id"] == Decoder().can_id("EMB_FL_Current")) & (seconds > 1.0) & (seconds < 2.0)
+    write_frames(tmp_path / "gap.log", frames[~unknown])
+    _, path, _ = rewritten.convert(tmp_path / "gap.log", rewritten.variants(250.0)["as it is"], tmp_path / "theirs")
+    there = [load_log(log).samples["has_current"] for log in (tmp_path / "gap.log", path)]
+    assert 0.2 < np.mean(~there[0]) < 0.4 and np.sum(there[0] != there[1]) < 5
 
 
 def test_without_its_mapping_a_clock_of_counts_is_said(recording, tmp_path):
