@@ -115,6 +115,7 @@ def variants(rate_Hz: float) -> dict[str, Rewritten]:
         ),
         "per cent of a current": Rewritten(_in_units(current=0.01 * _RATED_A), {"current": {"scale": 0.01 * _RATED_A}}),
         "current turned round": Rewritten(_in_units(current=-1.0), {"current": {"scale": -1}}),
+        "current without its sign": Rewritten(lambda table: table | {"current": np.abs(table["current"])}),
         "motion turned round": Rewritten(_in_units(angle=-1.0, speed=-1.0), {"angle": {"scale": -1}, "speed": {"scale": -1}}),
         "force turned round": Rewritten(_in_units(force=-1.0), {"force": {"scale": -1}}),
         "ms": Rewritten(_at(lambda t: np.round(1e3 * t, 3)), time={"unit": "ms"}),

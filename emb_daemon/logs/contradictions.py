@@ -27,9 +27,10 @@ _FOLLOWS = 0.2
 #: Correlation of force and current without acceleration below minus which the sign of one is wrong. Friction that holds the
 #: force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
 _AGAINST = 0.5
-#: How many times more of a current the load must leave than its power, or it is the motor's: of 120 drawn machines, and of
-#: nine recordings, the motor's leaves up to 1.01 times as much, a supply's mostly 1.3 and more.
-_BY_POWER = 1.25
+#: How many times more of a current the load must leave than its power or its size, or it is the motor's: of 120 drawn machines,
+#: and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3 and more.
+#: How often the signs of what a current needs are told again from the last fit.
+_OTHERWISE, _SIGNS = 1.25, 10
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
 #: Largest force of a log, N, below which it is not a clamp force in N: production brakes reach 10 to 40 kN.
@@ -116,7 +117,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if speed is not None and current is not None and load is not None and (moves or (bare and speed.is_resolved)):
         lines += _find_driving_friction(speed, current, load)
     if moves and load is not None:
-        lines += _find_supply(speed, current, force) if force is not None else []
+        lines += _find_other_current(speed, current, load)
         # What relaxes in pads looks like a delay.
         lines += _find_late_current(speed, current, force) if bare else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
@@ -489,10 +490,11 @@ def _find_driving_friction(speed: Series, current: Series, force: Series | float
     ]
 
 
-def _find_supply(speed: Series, current: Series, force: Series) -> list[str]:
-    """A line if the current goes with the power of load and acceleration instead of with themselves, as a supply's does."""
+def _find_other_current(speed: Series, current: Series, force: Series | float) -> list[str]:
+    """A line if the current goes with the power of load and acceleration instead of with themselves, as a supply's does, or
+    with the size of what they and friction need, as an effective value does."""
     times = current.time_ns[:_JUDGED]
-    at, load = speed.sampled(times), force.sampled(times)
+    at, load = speed.sampled(times), force.sampled(times) if isinstance(force, Series) else np.full(len(times), force)
     torques = np.stack([load, np.gradient(at, 1e-9 * times)], axis=1)
     # The load of a propeller or a pump is one of the speed, and tells nothing then.
     rest = np.stack([np.ones(len(times)), np.sign(at), at, at * np.abs(at)], axis=1)
@@ -506,12 +508,31 @@ def _find_supply(speed: Series, current: Series, force: Series) -> list[str]:
         return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
 
     by_load_A, by_power_A = left_A(torques), left_A(torques * at[:, None])
-    if not by_load_A > _BY_POWER * by_power_A:
+    by_size_A = _left_by_size(values, np.hstack([rest[:, :3], torques])[known])
+    if by_load_A > _OTHERWISE * by_size_A and by_size_A < by_power_A:
+        return [
+            f"CurrentQ goes with the size of what load, friction and acceleration need, of which it leaves {by_size_A:.2g} A, "
+            f"and not with that itself, which leaves {by_load_A:.2g} A: a phase's, an effective value? The motor's own has a sign"
+        ]
+    if not isinstance(force, Series) or not by_load_A > _OTHERWISE * by_power_A:
         return []
     return [
         f"CurrentQ goes with the load times the speed, of which it leaves {by_power_A:.2g} A, and not with the load, which "
         f"leaves {by_load_A:.2g} A: a drive takes such a current from its supply, and the motor's own is another"
     ]
+
+
+def _left_by_size(values: np.ndarray, columns: np.ndarray) -> float:
+    """What is left of a current by the size of a sum of columns, (n, k), found from the signs of each of them in turn."""
+    values, columns = values[:: len(values) // _COMPARED + 1], columns[:: len(values) // _COMPARED + 1]
+    left = []
+    for first in columns.T:
+        needed = first
+        for _ in range(_SIGNS):
+            signed = np.where(needed < 0.0, -1.0, 1.0)[:, None] * columns
+            needed = columns @ np.linalg.lstsq(signed, values)[0]
+        left.append(np.std(values - np.abs(needed)))
+    return float(min(left))
 
 
 def starts_anew(angle: Series) -> float:
