@@ -27,9 +27,9 @@ _FOLLOWS = 0.2
 #: Correlation of force and current without acceleration below minus which the sign of one is wrong. Friction that holds the
 #: force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
 _AGAINST = 0.5
-#: How many times more of a current the load must leave than its power or its size, or it is the motor's: of 120 drawn machines,
-#: and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3 and more.
-#: How often the signs of what a current needs are told again from the last fit.
+#: How many times more of a current the load must leave than its power or its size, or it is the motor's: of 120 drawn
+#: machines, and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3
+#: and more. How often the signs of what a current needs are told again from the last fit.
 _OTHERWISE, _SIGNS = 1.25, 10
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
@@ -512,7 +512,7 @@ def _find_other_current(speed: Series, current: Series, force: Series | float) -
     if by_load_A > _OTHERWISE * by_size_A and by_size_A < by_power_A:
         return [
             f"CurrentQ goes with the size of what load, friction and acceleration need, of which it leaves {by_size_A:.2g} A, "
-            f"and not with that itself, which leaves {by_load_A:.2g} A: a phase's, an effective value? The motor's own has a sign"
+            f"and not with that itself, which leaves {by_load_A:.2g} A: a phase's, an effective value? The motor's has a sign"
         ]
     if not isinstance(force, Series) or not by_load_A > _OTHERWISE * by_power_A:
         return []
