@@ -55,7 +55,15 @@ def test_a_current_that_was_not_measured_is_not_written(recording, tmp_path):
     assert 0.2 < np.mean(~there[0]) < 0.4 and np.sum(there[0] != there[1]) < 5
 
 
-def test_without_its_mapping_a_clock_of_counts_is_said(recording, tmp_path):
-    way = rewritten.variants(250.0)["counted rows"]
-    status, _, said = rewritten.convert(recording, way, tmp_path / "theirs", mapped=False)
-    assert (status, "or a counter's? Then `rate_Hz`" in said) == (0, True)
+@pytest.mark.parametrize(
+    ("name", "question"),
+    [
+        ("counted rows", "or a counter's? Then `rate_Hz`"),
+        ("untared", "was the sensor tared? `offset: -70"),
+        ("current without its sign", "The motor's has a sign"),
+    ],
+)
+def test_without_its_mapping_what_is_wrong_is_said(recording, tmp_path, name, question):
+    status, _, said = rewritten.convert(recording, rewritten.variants(250.0)[name], tmp_path / "theirs", mapped=False)
+    assert (status, question in said) == (0, True), said
+    assert question not in rewritten.convert(recording, rewritten.variants(250.0)["as it is"], tmp_path / "plain")[2]

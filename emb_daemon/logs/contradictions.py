@@ -24,6 +24,10 @@ _TRAVEL_RAD = 1.0
 _TOLD_APART = 0.5
 #: Least change of the force over the travel, as a share of the largest.
 _FOLLOWS = 0.2
+#: Shares of the travel up to which a motor stands and from which on a clamp has begun, least number of samples between them,
+#: and how alike an open brake's force is meanwhile, as a share of its range: a clamp that begins in contact has a slope there.
+#: Least share of the range that is no zero error of a tared load cell's.
+_STOOD, _BEGUN, _LEAST_IN_CLEARANCE, _FLAT, _TARED = 0.05, 0.15, 3, 0.02, 0.03
 #: Correlation of force and current without acceleration below minus which the sign of one is wrong. Friction that holds the
 #: force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
 _AGAINST = 0.5
@@ -129,7 +133,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if current is not None and np.ptp(current.values):
         lines += _find_unsigned(current) or _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
-        lines += _find_turned_force(angle, force) or _find_late_force(angle, force)
+        lines += _find_turned_force(angle, force) or [*_find_untared(angle, force), *_find_late_force(angle, force)]
     return lines
 
 
@@ -558,6 +562,25 @@ def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
     part = np.minimum(_PARTS * (angle.values - angle.values.min()) / (np.ptp(angle.values) or 1.0), _PARTS - 1).astype(int)
     means = [np.mean(at[known & (part == n)]) for n in range(_PARTS) if np.sum(known & (part == n)) >= _LEAST_IN_PART]
     return (float(means[0]), float(means[-1])) if len(means) > 1 else (0.0, 0.0)
+
+
+def _find_untared(angle: Series, force: Series) -> list[str]:
+    """A line on a force that is not zero before the first clamp and stays while the motor begins it, as of an open brake."""
+    at = force.sampled(angle.time_ns)
+    way = (angle.values - angle.values.min()) / np.ptp(angle.values)
+    # Later on pads that were let go press on for a while.
+    first = np.isfinite(at) & (np.arange(len(at)) < np.argmax(way > _BEGUN))
+    stood, moved = at[first & (way <= _STOOD)], at[first & (way > _STOOD)]
+    if len(stood) < _LEAST_IN_PART or len(moved) < _LEAST_IN_CLEARANCE:
+        return []
+    zero_N, change_N = float(np.mean(stood)), float(np.mean(moved) - np.mean(stood))
+    largest_N = float(np.ptp(np.quantile(at[np.isfinite(at)], (0.01, 0.99))))
+    if abs(change_N) > _FLAT * largest_N or abs(zero_N) < _TARED * largest_N:
+        return []
+    return [
+        f"ClampForceRef is {zero_N:.4g} N before the first clamp and stays while that begins, as of a brake that is open: was "
+        f"the sensor tared? `offset: {-zero_N:.4g}`"
+    ]
 
 
 def _without_inertia(current: np.ndarray, load: np.ndarray, acceleration: np.ndarray) -> np.ndarray | None:
