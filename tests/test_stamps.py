@@ -529,10 +529,15 @@ def _hoist(**factors: float) -> dict:
 def test_a_hoist_of_late_rows_tells_a_wrong_unit_and_direction(tmp_path, capsys, wrong, said):
     """What lies between its rows is unknown, but not how far it went in ten of them nor which way friction acts. Of a weight
     a current that is turned round has the wrong sign, a motion that is turned round has not."""
-    _read(tmp_path, _hoist(**wrong), foreignkit.COLUMNS.replace("signal: force_N, unit: N", "value: 4000"))
-    told = capsys.readouterr().err
-    assert said in told and ("scale" in told or "times as fast" in told) == bool(said)
-    assert "too rare for this motion: what lies between two samples is unknown, and is not filled in" in told
+    stated = foreignkit.COLUMNS.replace("signal: force_N, unit: N", "value: 4000")
+    for columns, mapping in (
+        (_hoist(**wrong), stated),
+        (_hoist(**wrong) | {"force_N": np.full(1240, 4000.0)}, foreignkit.COLUMNS),
+    ):
+        _read(tmp_path, columns, mapping)
+        told = capsys.readouterr().err
+        assert said in told and ("scale" in told or "times as fast" in told) == bool(said)
+        assert "too rare for this motion: what lies between two samples is unknown, and is not filled in" in told
 
 
 def test_slow_motion_with_the_stamps_of_a_busy_computer_is_not_too_rare(tmp_path, capsys):

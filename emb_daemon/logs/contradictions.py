@@ -117,7 +117,11 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         lines += _find_rounded(corner, angle, current, bare)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
     moves = not (speed is None or current is None or is_unresolved(corner, messages))
-    load = force if force is not None else messages[f"RIG_{corner}_Force"]["ClampForceRef"] if is_free else None
+    load = force
+    if is_free:
+        # One number, however many times a column has it.
+        stated, force = messages[f"RIG_{corner}_Force"]["ClampForceRef"], None
+        load = float(stated.values[0]) if isinstance(stated, Series) else stated
     if speed is not None and current is not None and load is not None and (moves or (bare and speed.is_resolved)):
         lines += _find_driving_friction(speed, current, load)
     if moves and load is not None:

@@ -558,8 +558,12 @@ def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray |
 
 
 def turns_free(corner: str, messages: Mapping[str, Signals]) -> bool:
-    """Whether a mapping states a constant load: the machine clamps nothing."""
-    return isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
+    """Whether the load is constant, as a mapping states it or a column of known weights: the machine clamps nothing. A force
+    that is 0 throughout was rather not measured."""
+    force = messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef")
+    if isinstance(force, Series):
+        return bool(len(force.values)) and force.values[0] != 0.0 and not np.ptp(force.values)
+    return isinstance(force, float | int)
 
 
 def is_bare(corner: str, messages: Mapping[str, Signals]) -> bool:
