@@ -238,6 +238,27 @@ def test_what_no_brake_does_is_said(truth, tmp_path, capsys, wrong, factor, said
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("step_s", "said"),
+    [(1.0, ""), (1000.0, "comes once in 1000 s, in which a brake has cooled"), (1.0 / 60.0, "K/s, as no backing plate does")],
+    ids=["seconds", "milliseconds taken for them", "minutes"],
+)
+def test_a_plate_that_cools_tells_the_unit_of_time(tmp_path, capsys, step_s, said):
+    """Heated for half an hour and let cool; nothing else was measured."""
+    ticks = np.arange(3600)
+    plate = 22.0 + 160.0 * np.where(ticks < 1800, 1.0 - np.exp(-ticks / 500.0), np.exp((1800 - ticks) / 700.0))
+    noisy = plate + np.random.default_rng(1).normal(0.0, 0.5, 3600)
+    rows = [f"{step_s * tick:.6f},{value:.3f}" for tick, value in zip(ticks.tolist(), noisy.tolist(), strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,plate", *rows]) + "\n")
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
+        "  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: plate, unit: degC}\n"
+    )
+    Mapping(tmp_path / "m.yaml").read(tmp_path / "a.csv")
+    told = capsys.readouterr().err
+    assert said in told and ("a brake has cooled" in told or "as no backing plate" in told) == bool(said)
+
+
 def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
     """As a measured one it would tell the torque path that nothing clamps: 9 kN of error."""
     columns = foreignkit.sampled(truth, 250.0)

@@ -83,6 +83,9 @@ _TYRE_M = (0.15, 0.8)
 _TURNS_RAD_PER_S, _ASTRAY = 3.0, 0.2
 #: Temperatures of surroundings, K, between which values in °C are likelier kelvins, and one that no backing plate lasts, °C.
 _KELVINS, _NO_PLATE_C = (233.15, 333.15), 900.0
+#: Time between two temperatures in which a brake cools, s. Fastest change of a backing plate's, K/s: through 10 mm of pad no
+#: 3 K/s reach it. Change that is told from noise, K, over how many parts of a log.
+_RARE_S, _FASTEST_K_PER_S, _CHANGES_K, _PLACES_OF_A_LOG = 600.0, 10.0, 20.0, 20
 #: Steps of our message that a value covers at least, or what it says is lost in rounding; those of an angle that turns.
 _LEAST_COVERED, _TURNS = 10.0, 50.0
 #: Least time for which a value stays while the motor turns, s, and in ordinary times between two of its changes; least share
@@ -289,7 +292,7 @@ def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:
 
 
 def _find_impossible_temperatures(corner: str, messages: dict[str, Signals]) -> list[str]:
-    """A line for each thermocouple whose values are kelvins, or an instrument's that measures nothing."""
+    """A line for each thermocouple whose values are kelvins, an instrument's that measures nothing, or of another time."""
     lines = []
     for name, values in messages.get(f"EMB_{corner}_Thermocouple", {}).items():
         if not isinstance(values, Series) or not len(values.values):
@@ -299,7 +302,27 @@ def _find_impossible_temperatures(corner: str, messages: dict[str, Signals]) -> 
             lines.append(f"{name} is {middle:.4g} °C, which no backing plate lasts: an open thermocouple, or a wrong unit?")
         elif _KELVINS[0] < low < _KELVINS[1]:
             lines.append(f"{name} is never below {low:.4g} °C: are these kelvins? Then `unit: K`")
+        if len(values.values) >= _LEAST:
+            lines += _find_other_time(name, values)
     return lines
+
+
+def _find_other_time(name: str, temperature: Series) -> list[str]:
+    """A line on a temperature that comes so rarely, or changes so fast, that its times are in another unit."""
+    period_s = 1e-9 * temperature.period_ns
+    if period_s > _RARE_S:
+        return [f"{name} comes once in {period_s:.4g} s, in which a brake has cooled: is the unit of time right?"]
+    # Noise is no change over so many samples.
+    apart = len(temperature.values) // _PLACES_OF_A_LOG
+    change = np.abs(temperature.values[apart:] - temperature.values[:-apart])
+    rates = change / (1e-9 * (temperature.time_ns[apart:] - temperature.time_ns[:-apart]))
+    fastest = float(np.max(rates[change > _CHANGES_K], initial=0.0))
+    if fastest < _FASTEST_K_PER_S:
+        return []
+    return [
+        f"{name} changes by {fastest:.3g} K/s, as no backing plate does: is the unit of time right, or does its thermocouple "
+        "open?"
+    ]
 
 
 def _find_unsigned(current: Series) -> list[str]:
