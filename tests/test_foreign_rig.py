@@ -174,6 +174,7 @@ def _segments(rows: int) -> str:
     )
 
 
+_OF_LINES = '"of the\nbench"\n"' + _HEADER.replace(",", '","') + '","more\n(in\nmm)"\n'
 _PAIRS = _HEADER.replace(",", ",,") + ",\n"
 
 
@@ -200,12 +201,13 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,\N{MINUS SIGN}5"), ""),
         (f"{_HEADER},,Press,300\n{_table(100)}", "rows have 6 cells, the header 9; its last name nothing: Press, 300"),
         (f"{_HEADER}\ns,rad,rad/s,A,degC,g\n\n{_table(100)}", "force_N says g and is taken in N: which is right?"),
+        (_OF_LINES + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,1"), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
         "two headers", "segments", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside",
         "late decimal commas", "quotes after blanks", "a typesetter's minus", "more names than cells",
-        "units above an empty line",
+        "units above an empty line", "names of several lines",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
@@ -308,6 +310,8 @@ def test_a_table_is_one_whatever_it_is_called(tmp_path, capsys):
         (b"\x89HDF", "not readable"),
         (b"a\rb\n", "not readable"),
         (b"\x80\x04\x95", "is a pickle of Python, which is not read"),
+        (bytes(257) + b"ustar", "is a tar archive, which is not read"),
+        (b"PK\x03\x04", "unpack an archive first"),
     ):
         (tmp_path / "c.csv").write_bytes(binary + bytes(100))
         with pytest.raises(InputError, match=said):

@@ -32,7 +32,10 @@ _PARQUET, _FEATHER, _WORKBOOKS = b"PAR1", b"ARROW1", (b"PK\x03\x04", b"\xd0\xcf\
 _BAGS = {
     b"#ROSBAG": "a ROS bag", b"\x89MCAP": "a ROS 2 bag", b"SQLite format 3": "a database, as ROS 2 bags are",
     b"\x80\x04\x95": "a pickle of Python", b"\x80\x05\x95": "a pickle of Python",
+    b"version https://git-lfs": "a pointer of Git LFS to a file that is not here",
 }  # fmt: skip
+#: Where a tar archive says that it is one, and what it says.
+_TAR_AT, _TAR = 257, b"ustar"
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Largest number of lines of text before a table's header, and of units between header and numbers.
@@ -72,6 +75,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
 #: A semicolon at the end of a line.
 _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
+#: A name in quotes of a few lines, which begins and ends a cell.
+_BROKEN = re.compile(rb'(?m)(?:(?<=[,;|\t ])|^)"[^",;|\t\n]{,50}(?:\r?\n[^",;|\t\n]{,50}){1,3}"(?=[,;|\t\r]|$)')
 #: Lines at the end of a text that do not begin with a number.
 _WORDS = re.compile(rb'(?:(?:^|\n)(?![ \t"]*[+-]?[\d.,]).*)+\Z')
 #: Cells that mean that nothing was measured.
@@ -92,7 +97,8 @@ def read_table(
     raw = read_file(path)
     ending = log_ending(path)
     content, digest = unpack(path, raw), hashlib.sha256(raw).hexdigest()
-    if bag := next((what for beginning, what in _BAGS.items() if content.startswith(beginning)), ""):
+    bag = next((what for beginning, what in _BAGS.items() if content.startswith(beginning)), "")
+    if bag := bag or ("a tar archive" if content.startswith(_TAR, _TAR_AT) else ""):
         raise InputError(f"{path}: is {bag}, which is not read; expected what it holds as CSV, Parquet or .mat")
     begins = ending_of_content(content)
     # `.dat` is the ending of INCA's measurements, and of other tools' text tables.
@@ -243,7 +249,8 @@ def _of_workbook(path: Path, content: bytes, names: list[str]) -> bytes:
         book = CalamineWorkbook.from_filelike(io.BytesIO(content))
         sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]
     except CalamineError as error:
-        raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
+        text = str(error).splitlines()[0]
+        raise InputError(f"{path}: not readable as a workbook: {text}; unpack an archive first") from None
     with_names = [len({*names} & {cell for row in rows[:_PREAMBLE] for cell in row}) for rows in sheets]
     most = max(with_names, default=0)
     alike = [name for name, count in zip(book.sheet_names, with_names, strict=True) if count == most > 0]
@@ -398,7 +405,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     content = _as_utf8(content, names)
     if b"\n" not in content:
         content = content.replace(b"\r", b"\n")
-    content = _unlabelled(_unterminated(content))
+    content = _in_one_line(_unlabelled(_unterminated(content)))
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
     ]
@@ -491,6 +498,13 @@ def _under_one_header(path: Path, content: bytes, header: int) -> bytes:
     tell(f"{path}: {told}")
     above = [_WORDS.sub(b"", part) if header else part for part in parts[:-1]]
     return b"\n".join([over, line, *above, parts[-1]])[1:]
+
+
+def _in_one_line(content: bytes) -> bytes:
+    """A table without the line breaks within its header's quotes, as spreadsheets put a unit under a name."""
+    *lines, rest = content.split(b"\n", _PREAMBLE)
+    above = _BROKEN.sub(lambda found: b" ".join(found[0].split()), b"\n".join(lines))
+    return b"\n".join([above, rest]) if lines else content
 
 
 def _are_pairs(names: list[str], rows: list[list[str]]) -> bool:
