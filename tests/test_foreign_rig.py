@@ -174,7 +174,7 @@ def _segments(rows: int) -> str:
     )
 
 
-_OF_LINES = '"of the\nbench"\n"' + _HEADER.replace(",", '","') + '","more\n(in\nmm)"\n'
+_OF_LINES = '"of the\nbench"\n' + _HEADER.replace(",", ',"more\n(in\nmm)",', 1) + "\n"
 _PAIRS = _HEADER.replace(",", ",,") + ",\n"
 
 
@@ -201,7 +201,7 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,\N{MINUS SIGN}5"), ""),
         (f"{_HEADER},,Press,300\n{_table(100)}", "rows have 6 cells, the header 9; its last name nothing: Press, 300"),
         (f"{_HEADER}\ns,rad,rad/s,A,degC,g\n\n{_table(100)}", "force_N says g and is taken in N: which is right?"),
-        (_OF_LINES + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,0,1"), ""),
+        (_OF_LINES + _table(100, "{t:.3f},1,{a:.1f},25.0,1.5,22,0"), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
