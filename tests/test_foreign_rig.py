@@ -375,6 +375,26 @@ def test_a_speed_that_is_another_motion_than_the_angle_is_left_out(tmp_path, cap
         assert ("another motion" in capsys.readouterr().err) == (share > 0.0)
 
 
+@pytest.mark.parametrize("load", ["a brake's", "none"])
+def test_a_few_late_stamps_cost_a_machine_that_clamps_nothing_no_speed(tmp_path, capsys, load):
+    """Two rows in a hundred and fifty are stamped when the one before was sampled. A contact would move with the angle."""
+    mapping = (
+        foreignkit.COLUMNS if load == "a brake's" else foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}")
+    )
+    foreignkit.write_rig(tmp_path, mapping)
+    true_s = 0.004 * np.arange(3000)
+    still, speed = 0.0 * true_s, 200.0 * np.sin(2.0 * true_s)
+    stamps = true_s.copy()
+    for first in range(100, 3000, 150):
+        stamps[first : first + 2] = true_s[first - 1 : first + 1]
+    columns = {"time_s": stamps, "angle_rad": 100.0 * (1.0 - np.cos(2.0 * true_s)), "speed_rad_per_s": speed}
+    columns |= {"current_A": still, "plate_C": 22.0 + still, "force_N": still}
+    table = foreignkit.write_table(tmp_path / "a.parquet", columns)
+    log = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read)
+    off = np.abs(log.samples["speed"] - np.interp(log.time_s, true_s, speed))[5:-5].max()
+    assert ("another motion" in capsys.readouterr().err, off > 50.0) == 2 * (load == "a brake's",)
+
+
 def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit(tmp_path, capsys):
     """A motor that swings at 20 Hz, sampled at 67: between two samples nobody knows the way."""
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
