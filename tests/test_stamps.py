@@ -976,7 +976,8 @@ def test_what_a_drive_takes_from_its_supply_is_no_current_of_the_motor(load, see
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("load", ["either sign", "one sign", "none"])
 def test_the_size_of_a_current_is_none_with_a_sign(load, seed):
-    """As of an effective value or a phase's amplitude; where a load holds the current's sign its size is itself."""
+    """As of an effective value or a phase's amplitude; where a load holds the current's sign its size is itself, and what goes
+    to both sides has a sign."""
     rng, time_s = np.random.default_rng(seed), 0.004 * np.arange(8000)
     speed = sum(rng.uniform(20.0, 60.0) * np.sin(rng.uniform(2.0, 12.0) * time_s + rng.uniform(0.0, 6.0)) for _ in range(3))
     lowest, highest = {"either sign": (-1.0, 1.0), "one sign": (0.6, 1.0), "none": (0.0, 0.0)}[load]
@@ -989,7 +990,8 @@ def test_the_size_of_a_current_is_none_with_a_sign(load, seed):
     def noisy(values: np.ndarray) -> Series:
         return Series(at, values + rng.normal(0.0, 0.002 * np.max(np.abs(values)), len(at)))
 
-    for current, said in ((motor_A, False), (np.abs(motor_A), load != "one sign")):
+    shifted_A = np.abs(motor_A) - 0.05 * np.max(np.abs(motor_A))
+    for current, said in ((motor_A, False), (np.abs(motor_A), load != "one sign"), (shifted_A, False)):
         messages = {
             "EMB_FL_Resolver": {"MotorSpeed": noisy(speed)},
             "EMB_FL_Current": {"CurrentQ": noisy(current)},

@@ -33,8 +33,9 @@ _STOOD, _BEGUN, _LEAST_IN_CLEARANCE, _FLAT, _TARED = 0.05, 0.15, 3, 0.02, 0.03
 _AGAINST = 0.5
 #: How many times more of a current the load must leave than its power or its size, or it is the motor's: of 120 drawn
 #: machines, and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3
-#: and more. How often the signs of what a current needs are told again from the last fit.
-_OTHERWISE, _SIGNS = 1.25, 10
+#: and more. How often the signs of what a current needs are told again from the last fit, and how far, as a share of its range,
+#: a current without a sign goes to the other side: on a dynamometer that drives one way the motor's own goes by 0.04.
+_OTHERWISE, _SIGNS, _OF_ONE_SIGN = 1.25, 10, 0.02
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
 #: Largest force of a log, N, below which it is not a clamp force in N: production brakes reach 10 to 40 kN.
@@ -554,7 +555,11 @@ def _find_other_current(speed: Series, current: Series, force: Series | float) -
 
 
 def _left_by_size(values: np.ndarray, columns: np.ndarray) -> float:
-    """What is left of a current by the size of a sum of columns, (n, k), found from the signs of each of them in turn."""
+    """What is left of a current without its sign by the size of a sum of columns, (n, k), found from the signs of each of them
+    in turn; infinity if it has one."""
+    low, high = np.quantile(values, (0.01, 0.99))
+    if min(-low, high) > _OF_ONE_SIGN * max(-low, high):
+        return np.inf
     values, columns = values[:: len(values) // _COMPARED + 1], columns[:: len(values) // _COMPARED + 1]
     left = []
     for first in columns.T:
@@ -562,8 +567,8 @@ def _left_by_size(values: np.ndarray, columns: np.ndarray) -> float:
         for _ in range(_SIGNS):
             signed = np.where(needed < 0.0, -1.0, 1.0)[:, None] * columns
             needed = columns @ np.linalg.lstsq(signed, values)[0]
-        left.append(np.std(values - np.abs(needed)))
-    return float(min(left))
+        left.append(float(np.std(values - np.abs(needed))))
+    return min(left)
 
 
 def starts_anew(angle: Series) -> float:
