@@ -990,7 +990,7 @@ def test_the_size_of_a_current_is_none_with_a_sign(load, seed):
     def noisy(values: np.ndarray) -> Series:
         return Series(at, values + rng.normal(0.0, 0.002 * np.max(np.abs(values)), len(at)))
 
-    shifted_A = np.abs(motor_A) - 0.05 * np.max(np.abs(motor_A))
+    shifted_A = np.abs(motor_A) - 0.2 * np.max(np.abs(motor_A))
     for current, said in ((motor_A, False), (np.abs(motor_A), load != "one sign"), (shifted_A, False)):
         messages = {
             "EMB_FL_Resolver": {"MotorSpeed": noisy(speed)},

@@ -33,8 +33,8 @@ _STOOD, _BEGUN, _LEAST_IN_CLEARANCE, _FLAT, _TARED = 0.05, 0.15, 3, 0.02, 0.03
 _AGAINST = 0.5
 #: How many times more of a current the load must leave than its power or its size, or it is the motor's: of 120 drawn
 #: machines, and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3
-#: and more. How often the signs of what a current needs are told again from the last fit, and how far, as a share of its range,
-#: a current without a sign goes to the other side: on a dynamometer that drives one way the motor's own goes by 0.04.
+#: and more. How often the signs of what a current needs are told again from the last fit, and how far, as a share of its
+#: range, a current without a sign goes to the other side: on a dynamometer that drives one way the motor's own goes by 0.04.
 _OTHERWISE, _SIGNS, _OF_ONE_SIGN = 1.25, 10, 0.02
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
