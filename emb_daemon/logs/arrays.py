@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -169,7 +169,9 @@ def _add(columns: dict[str, np.ndarray | list[object]], name: str, variable) -> 
         columns |= {f"{name} column {number + 1}".lstrip(): rows[:, number] for number in range(rows.shape[1])}
 
 
-def _add_parts(columns: dict[str, np.ndarray | list[object]], name: str, parts: np.ndarray, called) -> None:
+def _add_parts(
+    columns: dict[str, np.ndarray | list[object]], name: str, parts: np.ndarray, called: Callable[[int], str]
+) -> None:
     """MATLAB's cells, or one field of an array of structures: a column if each is a number or a text, otherwise as many
     variables, ``called`` by their number."""
     parts = [np.asarray(part).squeeze() for part in parts]
