@@ -20,7 +20,7 @@ from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import names
 from emb_daemon.logs.mapping import Mapping as Mapping
-from emb_daemon.logs.resample import Series, fill_missing, frames_of
+from emb_daemon.logs.resample import Series, filled, frames_of
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.logs.write import reference_columns, table_columns
 from emb_daemon.offline import Log, corner_index, estimate, log_of
@@ -156,7 +156,7 @@ def log_of_arrays(
     thermocouple = messages.get(f"EMB_{corner}_Thermocouple", {})
     if set(thermocouple) == {"CaliperTemp"}:
         raise InputError("caliper_C: expected inner_backplate_C or outer_backplate_C as well")
-    return log_of(frames_of({name: fill_missing(name, signals) for name, signals in messages.items()}), corner, Path("arrays"))
+    return log_of(frames_of(filled(messages)), corner, Path("arrays"))
 
 
 def _in_time(time_s: np.ndarray, columns: dict) -> tuple[np.ndarray, np.ndarray]:

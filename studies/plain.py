@@ -51,7 +51,7 @@ def _errors(fitted, judged, table, widths):
 
 
 def _over_current(log):
-    known, i, v = np.isfinite(log.force_N), log.samples["current_q"], log.samples["speed"]
+    known, i, v = np.isfinite(log.force_N) & log.samples["has_current"], log.samples["current_q"], log.samples["speed"]
     table = np.column_stack([i, np.ones(len(i)), np.tanh(v / 0.5), v, i * np.abs(i)])
     return table[known], log.force_N[known]
 
@@ -62,7 +62,7 @@ def _over_motion(log, fastest):
     acceleration, way = np.gradient(smooth, 1e-9 * s["time_ns"]), np.sign(v)
     table = np.column_stack([acceleration, way, v, np.ones(len(v)), way * np.exp(-np.abs(v) / (_FALLS * fastest))])
     # Where attribution judges it, too: friction holds a motor that stands, whatever its current.
-    turns = ~standing(log.time_s, s["angle"])
+    turns = ~standing(log.time_s, s["angle"]) & s["has_current"]
     turns[:_SAMPLES] = turns[-_SAMPLES:] = False
     return table[turns], s["current_q"][turns]
 

@@ -86,10 +86,8 @@ def _with_gaps(table: Table) -> Table:
 
 
 def _with_repeats(table: Table) -> Table:
-    again = np.flatnonzero(_random().random(len(table["time"])) < _REPEATS)
-    time = table["time"].copy()
-    time[again[again > 0]] = time[again[again > 0] - 1]
-    return table | {"time": time}
+    again = _random().random(len(table["time"])) < _REPEATS
+    return table | {"time": np.maximum.accumulate(np.where(again, table["time"][0], table["time"]))}
 
 
 def _random() -> np.random.Generator:
@@ -117,6 +115,7 @@ def variants(rate_Hz: float) -> dict[str, Rewritten]:
         ),
         "per cent of a current": Rewritten(_in_units(current=0.01 * _RATED_A), {"current": {"scale": 0.01 * _RATED_A}}),
         "current turned round": Rewritten(_in_units(current=-1.0), {"current": {"scale": -1}}),
+        "current without its sign": Rewritten(lambda table: table | {"current": np.abs(table["current"])}),
         "motion turned round": Rewritten(_in_units(angle=-1.0, speed=-1.0), {"angle": {"scale": -1}, "speed": {"scale": -1}}),
         "force turned round": Rewritten(_in_units(force=-1.0), {"force": {"scale": -1}}),
         "ms": Rewritten(_at(lambda t: np.round(1e3 * t, 3)), time={"unit": "ms"}),
@@ -145,7 +144,9 @@ def plain(path: Path) -> Table:
     """Columns of a log, the time in s."""
     log = load_log(path)
     samples = log.samples
-    found = {"angle": samples["angle"], "speed": samples["speed"], "current": samples["current_q"], "force": log.force_N}
+    # A sample without a current of its own carries the last one.
+    current = np.where(samples["has_current"], samples["current_q"], np.nan)
+    found = {"angle": samples["angle"], "speed": samples["speed"], "current": current, "force": log.force_N}
     return {"time": log.time_s, **found}
 
 
@@ -157,7 +158,7 @@ def convert(log: Path, way: Rewritten, folder: Path, mapped: bool = True) -> tup
     """
     folder.mkdir(parents=True, exist_ok=True)
     before = plain(log)
-    there = {name for name in COLUMNS if way.signals.get(name, {}) is not None and np.any(before[name])}
+    there = {name for name in COLUMNS if way.signals.get(name, {}) is not None and np.nan_to_num(before[name]).any()}
     table = {name: values for name, values in way.rewrite(before).items() if name in {"time", *there}}
     path, mapping, result = folder / f"{log.stem}.csv", folder / "mapping.yaml", folder / log.name
     lines = [way.separator.join(table)]

@@ -174,6 +174,7 @@ def _segments(rows: int) -> str:
     )
 
 
+_OF_LINES = '"of the\nbench"\n' + _HEADER.replace(",", ',"more\n(in\nmm)",', 1) + "\n"
 _PAIRS = _HEADER.replace(",", ",,") + ",\n"
 
 
@@ -200,12 +201,13 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (_HEADER + "\n" + _table(100, "{t:.3f},{a:.1f},25.0,1.5,22,\N{MINUS SIGN}5"), ""),
         (f"{_HEADER},,Press,300\n{_table(100)}", "rows have 6 cells, the header 9; its last name nothing: Press, 300"),
         (f"{_HEADER}\ns,rad,rad/s,A,degC,g\n\n{_table(100)}", "force_N says g and is taken in N: which is right?"),
+        (_OF_LINES + _table(100, "{t:.3f},1,{a:.1f},25.0,1.5,22,0"), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
         "two headers", "segments", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside",
         "late decimal commas", "quotes after blanks", "a typesetter's minus", "more names than cells",
-        "units above an empty line",
+        "units above an empty line", "names of several lines",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
@@ -232,12 +234,15 @@ def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, conte
         ("22.11.2026 08:15:{whole:02d}:{ms:03d}", "s"),
         ("22-Nov-2026 08:15:{s:06.3f}", "s"),
         ("{ns:d}", "ns"),
+        ("0 days 00:00:{s:09.6f}", "s"),
+        ("{part:d}", "ns"),
     ],
 )
 def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}"))
     rows = (
-        stamp.format(s=10.0 + 0.004 * n, whole=10, ms=4 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n) for n in range(100)
+        stamp.format(s=10.0 + 0.004 * n, whole=10, ms=4 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n, part=part)
+        for n, part in ((n, (800_000_000 + 4_000_000 * n) % 1_000_000_000) for n in range(100))
     )
     table = "".join(f"{time},{0.1 * n:.1f},25.0,1.5,22,0\n" for n, time in enumerate(rows))
     (tmp_path / "a.csv").write_text(f"{_HEADER}\n{table}")
@@ -298,13 +303,22 @@ def test_a_table_is_one_whatever_it_is_called(tmp_path, capsys):
     (tmp_path / "b.csv").write_text(f"{named.replace('time_s [x]', 'time_s')}\n{rows}")
     with pytest.raises(InputError, match=r"no such column; the table has time_s, angle_rad \[x\], speed_rad_per_s \[x\]"):
         mapping.read(tmp_path / "b.csv")
-    for binary in (b"PK\x03\x04", b"\x89HDF"):
+    (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("signal: time_s", "signal: '#time_s'"))
+    assert len(load_log(tmp_path / "a.log", read=Mapping(tmp_path / "mapping.yaml").read).samples) == 100
+    for binary, said in (
+        (b"PK\x03\x04", "not readable"),
+        (b"\x89HDF", "not readable"),
+        (b"a\rb\n", "not readable"),
+        (b"\x80\x04\x95", "is a pickle of Python, which is not read"),
+        (bytes(257) + b"ustar", "is a tar archive, which is not read"),
+        (b"PK\x03\x04", "unpack an archive first"),
+    ):
         (tmp_path / "c.csv").write_bytes(binary + bytes(100))
-        with pytest.raises(InputError, match="not readable"):
+        with pytest.raises(InputError, match=said):
             mapping.read(tmp_path / "c.csv")
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
 def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("time_s", "Uhrzeit").replace("plate_C", '"Temperatur [°C]"'))
     head = _HEADER.replace("time_s", "Uhrzeit").replace("plate_C", "Temperatur [°C]")
@@ -359,6 +373,26 @@ def test_a_speed_that_is_another_motion_than_the_angle_is_left_out(tmp_path, cap
         samples = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read).samples
         assert np.abs(samples["speed"][1:-1] - true[1:-1]).max() < 0.2
         assert ("another motion" in capsys.readouterr().err) == (share > 0.0)
+
+
+@pytest.mark.parametrize("load", ["a brake's", "none"])
+def test_a_few_late_stamps_cost_a_machine_that_clamps_nothing_no_speed(tmp_path, capsys, load):
+    """Two rows in a hundred and fifty are stamped when the one before was sampled. A contact would move with the angle."""
+    mapping = (
+        foreignkit.COLUMNS if load == "a brake's" else foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}")
+    )
+    foreignkit.write_rig(tmp_path, mapping)
+    true_s = 0.004 * np.arange(3000)
+    still, speed = 0.0 * true_s, 200.0 * np.sin(2.0 * true_s)
+    stamps = true_s.copy()
+    for first in range(100, 3000, 150):
+        stamps[first : first + 2] = true_s[first - 1 : first + 1]
+    columns = {"time_s": stamps, "angle_rad": 100.0 * (1.0 - np.cos(2.0 * true_s)), "speed_rad_per_s": speed}
+    columns |= {"current_A": still, "plate_C": 22.0 + still, "force_N": still}
+    table = foreignkit.write_table(tmp_path / "a.parquet", columns)
+    log = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read)
+    off = np.abs(log.samples["speed"] - np.interp(log.time_s, true_s, speed))[5:-5].max()
+    assert ("another motion" in capsys.readouterr().err, off > 50.0) == 2 * (load == "a brake's",)
 
 
 def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit(tmp_path, capsys):
@@ -479,6 +513,102 @@ def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
     (tmp_path / "mapping.yaml").write_text(mapping)
     path = _written(tmp_path / f"b{ending}", rest | cell | {"motion": motion.T})
     _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+
+
+def _matlab_with_references(path: Path, angle: np.ndarray, signals: list[np.ndarray], time: np.ndarray) -> None:
+    """As MATLAB 7.3 keeps cells and arrays of structures: references to parts that stand elsewhere."""
+    h5py = pytest.importorskip("h5py", reason="NOT RUN: the formats extra is not installed")
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, whose, values in (("out/signals/values", "", signals), ("cells", "cell", [angle])):
+            found = file.create_dataset(name, (1, len(values)), dtype=h5py.ref_dtype)
+            if whose:
+                found.attrs["MATLAB_class"] = np.bytes_(whose)
+            for number, part in enumerate(values):
+                file[f"#refs#/{whose}{number}"] = part[None]
+                found[0, number] = file[f"#refs#/{whose}{number}"].ref
+        file["time"] = time[None]
+        file["tt"] = np.zeros((1, 6), np.uint32)
+        file["tt"].attrs.update({"MATLAB_class": np.bytes_("timetable"), "MATLAB_object_decode": 3})
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def _element(kind: int, data: bytes) -> bytes:
+    """Of a file of MATLAB 5."""
+    return np.array([kind, len(data)], "<u4").tobytes() + data + bytes(-len(data) % 8)
+
+
+#: A timetable as MATLAB 5 keeps it, named tt: flags of an object of unknown size, three texts, a number.
+_TIMETABLE = _element(
+    14,
+    _element(6, np.array([17, 0], "<u4").tobytes())
+    + b"".join(_element(1, text) for text in (b"tt", b"MCOS", b"timetable"))
+    + _element(
+        14,
+        _element(6, np.array([13, 0], "<u4").tobytes())
+        + _element(5, np.array([1, 1], "<i4").tobytes())
+        + _element(1, b"")
+        + _element(6, np.array([1], "<u4").tobytes()),
+    ),
+)
+
+
+@pytest.mark.parametrize("version", [5, 7])
+def test_cells_and_structures_of_matlab_are_named_as_matlab_does(tmp_path, capsys, version):
+    """Simulink's structure with time has an array of structures; a timetable only MATLAB reads, which is said of it."""
+    columns, path = foreignkit.sampled(foreignkit.truth(), 250.0), tmp_path / "a.mat"
+    signals = [columns["current_A"], columns["force_N"]]
+    if version == 5:
+        parts = np.zeros(2, [("values", object), ("label", object)])
+        parts["values"], parts["label"] = [values[:, None] for values in signals], ["i", "F"]
+        cells = np.zeros(1, object)
+        cells[0] = columns["angle_rad"]
+        savemat(path, {"out": {"signals": parts}, "cells": np.append(cells, ["a"]), "time": columns["time_s"]})
+        path.write_bytes(path.read_bytes() + _TIMETABLE)
+    else:
+        _matlab_with_references(path, columns["angle_rad"], signals, columns["time_s"])
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: time}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: 'cells{1}', unit: rad}\n"
+        "  EMB_FL_Current.CurrentQ: {signal: out.signals(1).values, unit: A}\n"
+        "  RIG_FL_Force.ClampForceRef: {signal: out.signals(2).values, unit: N}\n"
+    )
+    log = load_log(path, read=Mapping(tmp_path / "m.yaml").read)
+    assert "tt is a timetable of MATLAB, which only MATLAB reads" in capsys.readouterr().err
+    assert np.abs(log.samples["angle"] - columns["angle_rad"]).max() < 2e-4
+    assert np.abs((log.samples["current_q"] - columns["current_A"])[1:]).max() < 0.02
+    assert np.nanmax(np.abs(log.force_N - columns["force_N"])) < 0.1
+    (tmp_path / "m.yaml").write_text((tmp_path / "m.yaml").read_text().replace("(2)", "(3)"))
+    with pytest.raises(InputError, match=r"values: no such variable of numbers; it has .*out\.signals\(2\)\.values"):
+        Mapping(tmp_path / "m.yaml").read(path)
+
+
+def test_numbers_and_texts_of_an_array_of_structures_are_columns(tmp_path):
+    rows = np.zeros(200, [("at", object), ("angle", object)])
+    rows["at"] = [f"2026-01-01T00:00:{0.004 * n:09.6f}" for n in range(200)]
+    rows["angle"] = [math.sin(0.05 * n) for n in range(200)]
+    savemat(tmp_path / "a.mat", {"s": rows})
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: s.at}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: s.angle, unit: rad}\n"
+    )
+    log = load_log(tmp_path / "a.mat", read=Mapping(tmp_path / "m.yaml").read)
+    assert log.time_s[-1] == pytest.approx(0.792, abs=0.005)
+    assert log.samples["angle"][-100:] == pytest.approx(np.sin(0.05 * np.arange(99, 199)), abs=2e-4)
+
+
+def test_topics_of_several_senders_in_one_table_keep_their_own_times(tmp_path, capsys):
+    """Joined by their stamps, each in rows of its own: two of them within a fraction of a millisecond are no burst."""
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    rows = []
+    for n, time_s in enumerate(columns["time_s"]):
+        angle, speed, current, plate, force = (f"{columns[name][n]:.6g}" for name in _HEADER.split(",")[1:])
+        rows += [f"{time_s:.6f},{angle},{speed},,,", f"{time_s + 3e-4:.6f},,,{current},,"]
+        rows += [f"{time_s + 7e-4:.6f},,,,{plate},{force}"] * (n % 5 == 0)
+    (tmp_path / "a.csv").write_text("\n".join([_HEADER, *rows]) + "\n")
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    assert "bunches" not in capsys.readouterr().err
+    assert len(samples) == len(columns["time_s"])
+    assert np.abs(samples["angle"] - columns["angle_rad"]).max() < 1e-3
 
 
 def _write_workbook(path: Path, sheets: dict[str, list]) -> None:
@@ -625,6 +755,23 @@ def test_a_time_may_be_a_duration_and_a_name_have_a_blank_that_breaks_no_line(tm
     assert np.nanmax(log.force_N) == pytest.approx(np.max(columns["force_N"]), rel=1e-3)
 
 
+@pytest.mark.parametrize("ending", [".parquet", ".npz"])
+def test_dates_and_structures_are_read_as_libraries_keep_them(tmp_path, ending):
+    columns, path = foreignkit.sampled(foreignkit.truth(), 250.0), tmp_path / f"a{ending}"
+    at = np.datetime64("2026-01-01") + np.rint(1e9 * columns["time_s"]).astype("timedelta64[ns]")
+    drive = pyarrow.StructArray.from_arrays([pyarrow.array(columns["angle_rad"])], ["angle"])
+    foreignkit.write_rig(
+        tmp_path, foreignkit.COLUMNS.replace("angle_rad", "drive.angle").replace("signal: time_s", "signal: time_s, unit: ms")
+    )
+    if ending == ".parquet":
+        pyarrow.parquet.write_table(pyarrow.table(columns | {"time_s": at, "drive": drive}), path)
+    else:
+        np.savez(path, **(columns | {"time_s": at, "drive.angle": columns["angle_rad"]}))
+    log = load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    assert log.time_s == pytest.approx(columns["time_s"] - columns["time_s"][0], abs=1e-5)
+    assert np.abs(log.samples["angle"] - columns["angle_rad"]).max() < 2e-4
+
+
 def test_stamps_of_json_lines_may_be_dates(tmp_path):
     rows = [{"at": f"2026-03-01T12:00:{second:02d}.500+01:00", "plate": 20.0 + second} for second in range(60)]
     (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, rows)))
@@ -671,6 +818,28 @@ def test_a_channel_that_is_there_twice_is_told_by_its_group(tmp_path):
             Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mf4")
     (tmp_path / "m.yaml").write_text(mapping.replace("angle,", "angle group 1,"))
     assert load_log(tmp_path / "a.mf4", read=Mapping(tmp_path / "m.yaml").read).samples["angle"][50] == pytest.approx(0.4)
+
+
+def test_a_channel_of_words_has_its_numbers_and_one_of_several_values_is_refused(tmp_path):
+    asammdf = pytest.importorskip("asammdf", reason="NOT RUN: the mf4 extra is not installed")
+    times = 0.004 * np.arange(100)
+    pairs = np.rec.fromarrays([np.column_stack([times, times])], [("pair", "<f8", (2,))])
+    words = {"val_0": 0, "text_0": b"off", "val_1": 1, "text_1": b"on"}
+    with asammdf.MDF() as file:
+        file.append(
+            [
+                asammdf.Signal(np.arange(100, dtype=np.uint8) // 50, times, name="switch", conversion=words),
+                asammdf.Signal(pairs, times, name="pair"),
+            ]
+        )
+        file.save(tmp_path / "a.mf4")
+    mapping = "format: 1\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: switch, unit: rad, scale: 5}\n"
+    (tmp_path / "m.yaml").write_text(mapping)
+    angle = load_log(tmp_path / "a.mf4", read=Mapping(tmp_path / "m.yaml").read).samples["angle"]
+    assert angle[[10, 90]].tolist() == pytest.approx([0.0, 5.0], abs=1e-3)
+    (tmp_path / "m.yaml").write_text(mapping.replace("switch", "pair"))
+    with pytest.raises(InputError, match="pair: each of its samples has several values; expected a channel of one"):
+        Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mf4")
 
 
 def test_estimates_of_another_actuator_are_said_to_be(bus, capsys):

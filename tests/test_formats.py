@@ -408,6 +408,33 @@ def test_frames_as_candump_shows_them_and_savvycan_keeps_them(tmp_path, name, te
         read_log(tmp_path / name)
 
 
+_ASC = """date Mon Jan 1 10:00:00.000 2026
+base hex  timestamps {format}
+no internal events logged
+   {times[0]} 1  123             Rx   d 8 11 22 33 44 55 66 77 88
+   {times[1]} Statistic: D 1 R 0 XD 0 XR 0 E 0 O 0 B 0.00%
+   {times[2]} 1  123             Rx   d 8 11 22 33 44 55 66 77 89
+   {times[3]} 1  18FEF131x       Rx   d 2 AB CD
+"""
+_CANDUMP = " ({times[0]})  can0  123   [1]  11\n ({times[1]})  can0  124   [1]  22\n ({times[2]})  can0  123   [1]  11\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "absolute", "relative"),
+    [
+        ("a.asc", _ASC, ["0.001000", "0.003000", "0.011000", "0.012000"], ["0.001000", "0.002000", "0.008000", "0.001000"]),
+        ("a.log", _CANDUMP, ["000.000000", "000.009500", "000.010000"], ["000.000000", "000.009500", "000.000500"]),
+    ],
+)
+def test_times_may_count_from_one_event_to_the_next(tmp_path, name, text, absolute, relative):
+    found = []
+    for kind, times in (("absolute", absolute), ("relative", relative)):
+        (tmp_path / name).write_text(text.format(format=kind, times=times))
+        found.append(read_log(tmp_path / name).frames)
+    assert np.array_equal(*found)
+    assert found[1]["time_ns"][-1] - found[1]["time_ns"][0] == round(1e9 * (float(absolute[-1]) - float(absolute[0])))
+
+
 _PEAK_TABLE = """;$FILEVERSION=2.1
 ;   Message   Time    Type    ID     Rx/Tx
 

@@ -37,9 +37,14 @@ def test_a_load_is_told_by_the_current():
         speed, current = _swings(phase), 20.0 * np.sin(0.7 * _TIME_S + phase)
         return _log(speed, current=current, force=100.0 * current + 300.0 * np.sign(speed) + 50.0, seed=seed)
 
-    errors = plain_fits([log(0.0, 1)], [log(1.0, 2)], _CALIBRATION)
     gain = _CALIBRATION.motor.gear_gain_m_per_rad
-    assert errors["friction"] < 60.0 * gain and errors["constant and offset"] > 250.0 * gain
+    whole = plain_fits([log(0.0, 1)], [log(1.0, 2)], _CALIBRATION)
+    assert whole["friction"] < 60.0 * gain and whole["constant and offset"] > 250.0 * gain
+    # While no current was measured the last one stays, which is none of the moment.
+    fitted = log(0.0, 1)
+    fitted.samples["has_current"][:2000] = False
+    fitted.samples["current_q"][:2000] = 20.0
+    assert plain_fits([fitted], [log(1.0, 2)], _CALIBRATION)["friction"] < 60.0 * gain
 
 
 @pytest.mark.parametrize("loop", [0.0, 200.0])

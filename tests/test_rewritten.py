@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from emb_daemon.calibration.files import load_calibration
+from emb_daemon.logs.columns import Decoder
+from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
 from emb_daemon.plant import scenarios as sc
@@ -43,7 +45,25 @@ def test_with_its_mapping_it_is_what_it_was(recording, tmp_path, name):
         assert np.quantile(np.abs(theirs - ours - turned), 0.95) < limit, column
 
 
-def test_without_its_mapping_a_clock_of_counts_is_said(recording, tmp_path):
-    way = rewritten.variants(250.0)["counted rows"]
-    status, _, said = rewritten.convert(recording, way, tmp_path / "theirs", mapped=False)
-    assert (status, "or a counter's? Then `rate_Hz`" in said) == (0, True)
+def test_a_current_that_was_not_measured_is_not_written(recording, tmp_path):
+    frames = read_frames(recording)
+    seconds = 1e-9 * (frames["time_ns"] - frames["time_ns"][0])
+    unknown = (frames["can_id"] == Decoder().can_id("EMB_FL_Current")) & (seconds > 1.0) & (seconds < 2.0)
+    write_frames(tmp_path / "gap.log", frames[~unknown])
+    _, path, _ = rewritten.convert(tmp_path / "gap.log", rewritten.variants(250.0)["as it is"], tmp_path / "theirs")
+    there = [load_log(log).samples["has_current"] for log in (tmp_path / "gap.log", path)]
+    assert 0.2 < np.mean(~there[0]) < 0.4 and np.sum(there[0] != there[1]) < 5
+
+
+@pytest.mark.parametrize(
+    ("name", "question"),
+    [
+        ("counted rows", "or a counter's? Then `rate_Hz`"),
+        ("untared", "was the sensor tared? `offset: -70"),
+        ("current without its sign", "The motor's has a sign"),
+    ],
+)
+def test_without_its_mapping_what_is_wrong_is_said(recording, tmp_path, name, question):
+    status, _, said = rewritten.convert(recording, rewritten.variants(250.0)[name], tmp_path / "theirs", mapped=False)
+    assert (status, question in said) == (0, True), said
+    assert question not in rewritten.convert(recording, rewritten.variants(250.0)["as it is"], tmp_path / "plain")[2]

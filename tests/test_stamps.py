@@ -238,6 +238,27 @@ def test_what_no_brake_does_is_said(truth, tmp_path, capsys, wrong, factor, said
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("step_s", "said"),
+    [(1.0, ""), (1000.0, "comes once in 1000 s, in which a brake has cooled"), (1.0 / 60.0, "K/s, as no backing plate does")],
+    ids=["seconds", "milliseconds taken for them", "minutes"],
+)
+def test_a_plate_that_cools_tells_the_unit_of_time(tmp_path, capsys, step_s, said):
+    """Heated for half an hour and let cool; nothing else was measured."""
+    ticks = np.arange(3600)
+    plate = 22.0 + 160.0 * np.where(ticks < 1800, 1.0 - np.exp(-ticks / 500.0), np.exp((1800 - ticks) / 700.0))
+    noisy = plate + np.random.default_rng(1).normal(0.0, 0.5, 3600)
+    rows = [f"{step_s * tick:.6f},{value:.3f}" for tick, value in zip(ticks.tolist(), noisy.tolist(), strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,plate", *rows]) + "\n")
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
+        "  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: plate, unit: degC}\n"
+    )
+    Mapping(tmp_path / "m.yaml").read(tmp_path / "a.csv")
+    told = capsys.readouterr().err
+    assert said in told and ("a brake has cooled" in told or "as no backing plate" in told) == bool(said)
+
+
 def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
     """As a measured one it would tell the torque path that nothing clamps: 9 kN of error."""
     columns = foreignkit.sampled(truth, 250.0)
@@ -529,10 +550,15 @@ def _hoist(**factors: float) -> dict:
 def test_a_hoist_of_late_rows_tells_a_wrong_unit_and_direction(tmp_path, capsys, wrong, said):
     """What lies between its rows is unknown, but not how far it went in ten of them nor which way friction acts. Of a weight
     a current that is turned round has the wrong sign, a motion that is turned round has not."""
-    _read(tmp_path, _hoist(**wrong), foreignkit.COLUMNS.replace("signal: force_N, unit: N", "value: 4000"))
-    told = capsys.readouterr().err
-    assert said in told and ("scale" in told or "times as fast" in told) == bool(said)
-    assert "too rare for this motion: what lies between two samples is unknown, and is not filled in" in told
+    stated = foreignkit.COLUMNS.replace("signal: force_N, unit: N", "value: 4000")
+    for columns, mapping in (
+        (_hoist(**wrong), stated),
+        (_hoist(**wrong) | {"force_N": np.full(1240, 4000.0)}, foreignkit.COLUMNS),
+    ):
+        _read(tmp_path, columns, mapping)
+        told = capsys.readouterr().err
+        assert said in told and ("scale" in told or "times as fast" in told) == bool(said)
+        assert "too rare for this motion: what lies between two samples is unknown, and is not filled in" in told
 
 
 def test_slow_motion_with_the_stamps_of_a_busy_computer_is_not_too_rare(tmp_path, capsys):
@@ -945,6 +971,33 @@ def test_what_a_drive_takes_from_its_supply_is_no_current_of_the_motor(load, see
         signals = ("MotorSpeed", "CurrentQ", "ClampForceRef")
         lines = contradictions("FL", {name: {signal: messages[name]} for name, signal in zip(messages, signals, strict=True)})
         assert any("takes such a current from its supply" in line for line in lines) == said
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("load", ["either sign", "one sign", "none"])
+def test_the_size_of_a_current_is_none_with_a_sign(load, seed):
+    """As of an effective value or a phase's amplitude; where a load holds the current's sign its size is itself, and what goes
+    to both sides has a sign."""
+    rng, time_s = np.random.default_rng(seed), 0.004 * np.arange(8000)
+    speed = sum(rng.uniform(20.0, 60.0) * np.sin(rng.uniform(2.0, 12.0) * time_s + rng.uniform(0.0, 6.0)) for _ in range(3))
+    lowest, highest = {"either sign": (-1.0, 1.0), "one sign": (0.6, 1.0), "none": (0.0, 0.0)}[load]
+    torque = np.repeat(rng.uniform(lowest, highest, 40), 200)
+    acceleration = np.gradient(speed, time_s)
+    accelerates = rng.uniform(0.1, 0.3) * acceleration / np.max(np.abs(acceleration))
+    motor_A = 10.0 * (torque + rng.uniform(0.02, 0.1) * np.sign(speed) + accelerates)
+    at = (1e9 * time_s).astype(np.int64)
+
+    def noisy(values: np.ndarray) -> Series:
+        return Series(at, values + rng.normal(0.0, 0.002 * np.max(np.abs(values)), len(at)))
+
+    shifted_A = np.abs(motor_A) - 0.2 * np.max(np.abs(motor_A))
+    for current, said in ((motor_A, False), (np.abs(motor_A), load != "one sign"), (shifted_A, False)):
+        messages = {
+            "EMB_FL_Resolver": {"MotorSpeed": noisy(speed)},
+            "EMB_FL_Current": {"CurrentQ": noisy(current)},
+            "RIG_FL_Force": {"ClampForceRef": noisy(torque) if load != "none" else 0.0},
+        }
+        assert any("goes with the size of what load" in line for line in contradictions("FL", messages)) == said
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,8 @@ def array_ending(content: bytes, ending: str) -> str:
 
 def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray | list[object]]:
     """Columns, n values each, by name: a variable with more than one value, `S.x` of the field of a structure or the dataset
-    of a group, `X column 2` of a matrix, whose rows are its longer side. Of a bare array `column 2` is one.
+    of a group, `S(2).x` of one of several structures, `c{2}` of cells, `X column 2` of a matrix, whose rows are its longer
+    side. Of a bare array `column 2` is one.
 
     Raises:
         InputError: unreadable.
@@ -40,13 +41,21 @@ def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray
     return columns
 
 
-def _of_matlab(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
+def _of_matlab(path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
     from scipy.io import loadmat
+    from scipy.io.matlab import MatlabOpaque
 
     for name, variable in loadmat(io.BytesIO(content), squeeze_me=True).items():
+        if isinstance(variable, MatlabOpaque):
+            named, _, kind, _ = variable.item() if variable.ndim == 0 else variable[0]
+            _tell_object(path, named.decode(), kind.decode())
         # Names with two lines before them are what the file says of itself.
-        if not name.startswith("__"):
+        elif not name.startswith("__"):
             yield name, np.asarray(variable)
+
+
+def _tell_object(path: Path, name: str, kind: str) -> None:
+    tell(f"{path}: {name} is a {kind} of MATLAB, which only MATLAB reads; save its columns as variables of their own")
 
 
 def _of_numpy(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
@@ -58,17 +67,30 @@ def _of_numpy(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
             yield from found.items()
 
 
-def _of_hdf5(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """Datasets by their groups, `group.dataset`; those of a MATLAB 7.3 file are its variables."""
+def _of_hdf5(path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
+    """Datasets by their groups, `group.dataset`; those of a MATLAB 7.3 file are its variables, of which cells and arrays of
+    structures refer to their parts."""
     import h5py
 
-    found = []
+    def parts(group, name: str, item) -> Iterator[tuple[str, np.ndarray]]:
+        if isinstance(item, h5py.Group):
+            for key, part in item.items():
+                # What begins with a # is MATLAB's own, not a variable.
+                if key[0] != "#":
+                    yield from parts(name, _within(name, key), part)
+        elif "MATLAB_object_decode" in item.attrs:
+            _tell_object(path, name, bytes(item.attrs["MATLAB_class"]).decode())
+        elif item.dtype == h5py.ref_dtype:
+            key = name.removeprefix(group).removeprefix(".")
+            in_cells = not group or item.attrs.get("MATLAB_class") == b"cell"
+            for number, reference in enumerate(item[()].ravel(), 1):
+                called = f"{name}{{{number}}}" if in_cells else f"{group}({number}).{key}"
+                yield from parts(called, called, item.file[reference])
+        elif item.size:
+            yield name, item[()]
+
     with h5py.File(io.BytesIO(content)) as file:
-        # What begins with a # is MATLAB's own, not a variable.
-        file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) and name[0] != "#" else None)
-        for name in found:
-            if file[name].size:
-                yield name.replace("/", "."), file[name][()]
+        yield from parts("", "", file)
 
 
 def _of_tdms(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
@@ -77,10 +99,7 @@ def _of_tdms(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
 
     for group in TdmsFile.read(io.BytesIO(content)).groups():
         for channel in group.channels():
-            values = channel[:]
-            if values.dtype.kind == "M":
-                values = 1e-9 * values.astype("datetime64[ns]").astype(np.int64)
-            yield f"{group.name}.{channel.name}", values
+            yield f"{group.name}.{channel.name}", channel[:]
 
 
 def _of_json(path: Path, content: bytes) -> Iterator[tuple[str, object]]:
@@ -135,12 +154,32 @@ def _add(columns: dict[str, np.ndarray | list[object]], name: str, variable) -> 
     if variable.dtype.names:
         for field in variable.dtype.names:
             part = variable[field]
-            _add(columns, _within(name, field), np.asarray(part.item() if part.dtype == object and part.ndim == 0 else part))
-    elif variable.dtype.kind in "biuf" and variable.ndim == 1:
+            if part.dtype == object and part.ndim == 1:
+                _add_parts(columns, _within(name, field), part, lambda number, field=field: f"{name}({number}).{field}")
+            else:
+                _add(columns, _within(name, field), part.item() if part.dtype == object and part.ndim == 0 else part)
+    elif variable.dtype == object and variable.ndim == 1:
+        _add_parts(columns, name, variable, lambda number: f"{name}{{{number}}}")
+    elif variable.dtype.kind == "U" and variable.ndim == 1:
+        columns[name] = variable.tolist()
+    elif variable.dtype.kind in "biufMm" and variable.ndim == 1:
         columns[name or "column 1"] = variable
     elif variable.dtype.kind in "biuf" and variable.ndim == 2:
         rows = variable if variable.shape[0] >= variable.shape[1] else variable.T
         columns |= {f"{name} column {number + 1}".lstrip(): rows[:, number] for number in range(rows.shape[1])}
+
+
+def _add_parts(
+    columns: dict[str, np.ndarray | list[object]], name: str, parts: np.ndarray, called: Callable[[int], str]
+) -> None:
+    """MATLAB's cells, or one field of an array of structures: a column if each is a number or a text, otherwise as many
+    variables, ``called`` by their number."""
+    parts = [np.asarray(part).squeeze() for part in parts]
+    if all(part.ndim == 0 and part.dtype.kind in "biufU" for part in parts):
+        _add(columns, name, [part.item() for part in parts])
+    else:
+        for number, part in enumerate(parts, 1):
+            _add(columns, called(number), part)
 
 
 def _within(name: str, key: str) -> str:

@@ -24,12 +24,18 @@ _TRAVEL_RAD = 1.0
 _TOLD_APART = 0.5
 #: Least change of the force over the travel, as a share of the largest.
 _FOLLOWS = 0.2
+#: Shares of the travel up to which a motor stands and from which on a clamp has begun, least number of samples between them,
+#: and how alike an open brake's force is meanwhile, as a share of its range: a clamp that begins in contact has a slope there.
+#: Least share of the range that is no zero error of a tared load cell's.
+_STOOD, _BEGUN, _LEAST_IN_CLEARANCE, _FLAT, _TARED = 0.05, 0.15, 3, 0.02, 0.03
 #: Correlation of force and current without acceleration below minus which the sign of one is wrong. Friction that holds the
 #: force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
 _AGAINST = 0.5
-#: How many times more of a current the load must leave than its power, or it is the motor's: of 120 drawn machines, and of
-#: nine recordings, the motor's leaves up to 1.01 times as much, a supply's mostly 1.3 and more.
-_BY_POWER = 1.25
+#: How many times more of a current the load must leave than its power or its size, or it is the motor's: of 120 drawn
+#: machines, and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3
+#: and more. How often the signs of what a current needs are told again from the last fit, and how far, as a share of its
+#: range, a current without a sign goes to the other side: on a dynamometer that drives one way the motor's own goes by 0.04.
+_OTHERWISE, _SIGNS, _OF_ONE_SIGN = 1.25, 10, 0.02
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
 #: Largest force of a log, N, below which it is not a clamp force in N: production brakes reach 10 to 40 kN.
@@ -78,6 +84,9 @@ _TYRE_M = (0.15, 0.8)
 _TURNS_RAD_PER_S, _ASTRAY = 3.0, 0.2
 #: Temperatures of surroundings, K, between which values in °C are likelier kelvins, and one that no backing plate lasts, °C.
 _KELVINS, _NO_PLATE_C = (233.15, 333.15), 900.0
+#: Time between two temperatures in which a brake cools, s. Fastest change of a backing plate's, K/s: through 10 mm of pad no
+#: 3 K/s reach it. Change that is told from noise, K, over how many parts of a log.
+_RARE_S, _FASTEST_K_PER_S, _CHANGES_K, _PLACES_OF_A_LOG = 600.0, 10.0, 20.0, 20
 #: Steps of our message that a value covers at least, or what it says is lost in rounding; those of an angle that turns.
 _LEAST_COVERED, _TURNS = 10.0, 50.0
 #: Least time for which a value stays while the motor turns, s, and in ordinary times between two of its changes; least share
@@ -112,11 +121,15 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         lines += _find_rounded(corner, angle, current, bare)
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
     moves = not (speed is None or current is None or is_unresolved(corner, messages))
-    load = force if force is not None else messages[f"RIG_{corner}_Force"]["ClampForceRef"] if is_free else None
+    load = force
+    if is_free:
+        # One number, however many times a column has it.
+        stated, force = messages[f"RIG_{corner}_Force"]["ClampForceRef"], None
+        load = float(stated.values[0]) if isinstance(stated, Series) else stated
     if speed is not None and current is not None and load is not None and (moves or (bare and speed.is_resolved)):
         lines += _find_driving_friction(speed, current, load)
     if moves and load is not None:
-        lines += _find_supply(speed, current, force) if force is not None else []
+        lines += _find_other_current(speed, current, load)
         # What relaxes in pads looks like a delay.
         lines += _find_late_current(speed, current, force) if bare else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
@@ -128,7 +141,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if current is not None and np.ptp(current.values):
         lines += _find_unsigned(current) or _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
-        lines += _find_turned_force(angle, force) or _find_late_force(angle, force)
+        lines += _find_turned_force(angle, force) or [*_find_untared(angle, force), *_find_late_force(angle, force)]
     return lines
 
 
@@ -280,7 +293,7 @@ def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:
 
 
 def _find_impossible_temperatures(corner: str, messages: dict[str, Signals]) -> list[str]:
-    """A line for each thermocouple whose values are kelvins, or an instrument's that measures nothing."""
+    """A line for each thermocouple whose values are kelvins, an instrument's that measures nothing, or of another time."""
     lines = []
     for name, values in messages.get(f"EMB_{corner}_Thermocouple", {}).items():
         if not isinstance(values, Series) or not len(values.values):
@@ -290,7 +303,27 @@ def _find_impossible_temperatures(corner: str, messages: dict[str, Signals]) -> 
             lines.append(f"{name} is {middle:.4g} °C, which no backing plate lasts: an open thermocouple, or a wrong unit?")
         elif _KELVINS[0] < low < _KELVINS[1]:
             lines.append(f"{name} is never below {low:.4g} °C: are these kelvins? Then `unit: K`")
+        if len(values.values) >= _LEAST:
+            lines += _find_other_time(name, values)
     return lines
+
+
+def _find_other_time(name: str, temperature: Series) -> list[str]:
+    """A line on a temperature that comes so rarely, or changes so fast, that its times are in another unit."""
+    period_s = 1e-9 * temperature.period_ns
+    if period_s > _RARE_S:
+        return [f"{name} comes once in {period_s:.4g} s, in which a brake has cooled: is the unit of time right?"]
+    # Noise is no change over so many samples.
+    apart = len(temperature.values) // _PLACES_OF_A_LOG
+    change = np.abs(temperature.values[apart:] - temperature.values[:-apart])
+    rates = change / (1e-9 * (temperature.time_ns[apart:] - temperature.time_ns[:-apart]))
+    fastest = float(np.max(rates[change > _CHANGES_K], initial=0.0))
+    if fastest < _FASTEST_K_PER_S:
+        return []
+    return [
+        f"{name} changes by {fastest:.3g} K/s, as no backing plate does: is the unit of time right, or does its thermocouple "
+        "open?"
+    ]
 
 
 def _find_unsigned(current: Series) -> list[str]:
@@ -489,10 +522,11 @@ def _find_driving_friction(speed: Series, current: Series, force: Series | float
     ]
 
 
-def _find_supply(speed: Series, current: Series, force: Series) -> list[str]:
-    """A line if the current goes with the power of load and acceleration instead of with themselves, as a supply's does."""
+def _find_other_current(speed: Series, current: Series, force: Series | float) -> list[str]:
+    """A line if the current goes with the power of load and acceleration instead of with themselves, as a supply's does, or
+    with the size of what they and friction need, as an effective value does."""
     times = current.time_ns[:_JUDGED]
-    at, load = speed.sampled(times), force.sampled(times)
+    at, load = speed.sampled(times), force.sampled(times) if isinstance(force, Series) else np.full(len(times), force)
     torques = np.stack([load, np.gradient(at, 1e-9 * times)], axis=1)
     # The load of a propeller or a pump is one of the speed, and tells nothing then.
     rest = np.stack([np.ones(len(times)), np.sign(at), at, at * np.abs(at)], axis=1)
@@ -506,12 +540,35 @@ def _find_supply(speed: Series, current: Series, force: Series) -> list[str]:
         return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
 
     by_load_A, by_power_A = left_A(torques), left_A(torques * at[:, None])
-    if not by_load_A > _BY_POWER * by_power_A:
+    by_size_A = _left_by_size(values, np.hstack([rest[:, :3], torques])[known])
+    if by_load_A > _OTHERWISE * by_size_A and by_size_A < by_power_A:
+        return [
+            f"CurrentQ goes with the size of what load, friction and acceleration need, of which it leaves {by_size_A:.2g} A, "
+            f"and not with that itself, which leaves {by_load_A:.2g} A: a phase's, an effective value? The motor's has a sign"
+        ]
+    if not isinstance(force, Series) or not by_load_A > _OTHERWISE * by_power_A:
         return []
     return [
         f"CurrentQ goes with the load times the speed, of which it leaves {by_power_A:.2g} A, and not with the load, which "
         f"leaves {by_load_A:.2g} A: a drive takes such a current from its supply, and the motor's own is another"
     ]
+
+
+def _left_by_size(values: np.ndarray, columns: np.ndarray) -> float:
+    """What is left of a current without its sign by the size of a sum of columns, (n, k), found from the signs of each of them
+    in turn; infinity if it has one."""
+    low, high = np.quantile(values, (0.01, 0.99))
+    if min(-low, high) > _OF_ONE_SIGN * max(-low, high):
+        return np.inf
+    values, columns = values[:: len(values) // _COMPARED + 1], columns[:: len(values) // _COMPARED + 1]
+    left = []
+    for first in columns.T:
+        needed = first
+        for _ in range(_SIGNS):
+            signed = np.where(needed < 0.0, -1.0, 1.0)[:, None] * columns
+            needed = columns @ np.linalg.lstsq(signed, values)[0]
+        left.append(float(np.std(values - np.abs(needed))))
+    return min(left)
 
 
 def starts_anew(angle: Series) -> float:
@@ -537,6 +594,25 @@ def _by_travel(angle: Series, other: Series) -> tuple[float, float]:
     part = np.minimum(_PARTS * (angle.values - angle.values.min()) / (np.ptp(angle.values) or 1.0), _PARTS - 1).astype(int)
     means = [np.mean(at[known & (part == n)]) for n in range(_PARTS) if np.sum(known & (part == n)) >= _LEAST_IN_PART]
     return (float(means[0]), float(means[-1])) if len(means) > 1 else (0.0, 0.0)
+
+
+def _find_untared(angle: Series, force: Series) -> list[str]:
+    """A line on a force that is not zero before the first clamp and stays while the motor begins it, as of an open brake."""
+    at = force.sampled(angle.time_ns)
+    way = (angle.values - angle.values.min()) / np.ptp(angle.values)
+    # Later on pads that were let go press on for a while.
+    first = np.isfinite(at) & (np.arange(len(at)) < np.argmax(way > _BEGUN))
+    stood, moved = at[first & (way <= _STOOD)], at[first & (way > _STOOD)]
+    if len(stood) < _LEAST_IN_PART or len(moved) < _LEAST_IN_CLEARANCE:
+        return []
+    zero_N, change_N = float(np.mean(stood)), float(np.mean(moved) - np.mean(stood))
+    largest_N = float(np.ptp(np.quantile(at[np.isfinite(at)], (0.01, 0.99))))
+    if abs(change_N) > _FLAT * largest_N or abs(zero_N) < _TARED * largest_N:
+        return []
+    return [
+        f"ClampForceRef is {zero_N:.4g} N before the first clamp and stays while that begins, as of a brake that is open: was "
+        f"the sensor tared? `offset: {-zero_N:.4g}`"
+    ]
 
 
 def _without_inertia(current: np.ndarray, load: np.ndarray, acceleration: np.ndarray) -> np.ndarray | None:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 
 #: What candump shows on a terminal with its option for times: ``(seconds)  interface  id   [length]  bytes``.
 _SHOWN = re.compile(
@@ -41,8 +42,15 @@ _PEAK_ROW = re.compile(
 )
 _PEAK_MESSAGES, _PEAK_FD = (b"DT", b"RR"), (b"FD", b"FB", b"FE", b"BI")
 _PEAK_OTHER = re.compile(rb"\s*(\d+\)?[,;\t|]|;|$)")
+#: How a line begins with its time; a text of Vector whose times count from one event to the next; least share of them that
+#: go back where the times that candump shows do so.
+_STAMP, _ASC_RELATIVE, _GOES_BACK = (
+    re.compile(rb"(?m)^([ \t]*\(?)(\d+\.\d+)(?=[\s)])"), re.compile(rb"(?mi)^base\s+\w+\s+timestamps\s+relative\b"), 0.1,
+)  # fmt: skip
 #: Lines at the beginning of a file among which the first frame is looked for.
 _FIRST_LINES = 100
+#: Number of bytes that hold a header.
+_HEADER_BYTES = 1000
 
 
 def as_candump(content: bytes) -> bytes | None:
@@ -58,10 +66,29 @@ def as_candump(content: bytes) -> bytes | None:
     if _CANHACKER.fullmatch(first.strip()):
         return b"\n".join(_of_canhacker(content.split(b"\n")))
     if _SHOWN.fullmatch(first.strip()):
-        return b"\n".join(map(_of_terminal, content.split(b"\n")))
+        stamps = [float(stamp) for _, stamp in _STAMP.findall(content)]
+        back = sum(after < before for before, after in pairwise(stamps))
+        return b"\n".join(map(_of_terminal, (_summed(content) if back > _GOES_BACK * len(stamps) else content).split(b"\n")))
     if any(map(_PEAK_ROW.fullmatch, content.split(b"\n", _FIRST_LINES)[:_FIRST_LINES])):
         return b"\n".join(_of_peak_table(content.split(b"\n")))
     return None
+
+
+def _summed(content: bytes) -> bytes:
+    """Lines whose times count from the line before, counted from the first."""
+    passed_ns = 0
+
+    def later(found: re.Match[bytes]) -> bytes:
+        nonlocal passed_ns
+        passed_ns += round(1e9 * float(found[2]))
+        return b"%s%d.%09d" % (found[1], *divmod(passed_ns, 1_000_000_000))
+
+    return _STAMP.sub(later, content)
+
+
+def with_absolute_times(content: bytes) -> bytes:
+    """A text of Vector as python-can's reader knows it, whose times count from the first event."""
+    return _summed(content) if _ASC_RELATIVE.search(content, 0, _HEADER_BYTES) else content
 
 
 def tidied_trace(content: bytes) -> bytes:

@@ -25,7 +25,7 @@ from emb_daemon.logs.resample import (
     HEADER,
     SUBSTITUTES,
     Series,
-    fill_missing,
+    filled,
     frames_of,
     is_bare,
     is_received,
@@ -429,7 +429,7 @@ class Mapping:
         for name in messages:
             if name.endswith("_Resolver") and not self._sources(name):
                 messages[name] = standing(messages, messages[name]["MotorAngle"])
-        frames = frames_of({name: fill_missing(name, signals) for name, signals in messages.items()})
+        frames = frames_of(filled(messages))
         if not len(frames):
             found = f"; found {ids_in(recorded.frames)}" if self.databases else ""
             raise InputError(f"{path}: no value of {self._clocks()} in it, which {self.path} names{found}")

@@ -21,7 +21,7 @@ from emb_daemon.errors import InputError, tell
 from emb_daemon.logs.apart import mdf_columns
 from emb_daemon.logs.blf import read_blf
 from emb_daemon.logs.candump import parse_candump
-from emb_daemon.logs.dialects import as_candump, tidied_trace
+from emb_daemon.logs.dialects import as_candump, tidied_trace, with_absolute_times
 from emb_daemon.logs.inflate import inflate
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.wire.contract import CYCLE_NS
@@ -172,6 +172,8 @@ def _python_can(reader_name: str, path: Path, content: bytes) -> _Parsed:
 
     if reader_name == "TRCReader":
         content = tidied_trace(content)
+    if reader_name == "ASCReader":
+        content = with_absolute_times(content)
     kind, file, octets, rows, channels = getattr(can, reader_name), io.BytesIO(content), bytearray(), [], []
     try:
         for message in kind(io.TextIOWrapper(file) if issubclass(kind, TextIOMessageReader) else file):

@@ -56,8 +56,9 @@ _LEAST_SAMPLES, _IN_TURN = 50, 0.9
 _PAUSE = 10
 #: A step of the angle that differs from the integrated speed by more than this angle (rad), plus the change of speed times the
 #: time (s) between the sampling of both, looks to the estimator like a resolver that lost its zero. That happens once and not
-#: repeatedly: largest share of such steps.
-_SLIP_RAD, _SLIP_DELAY_S, _MOST_APART = 0.3, 0.01, 0.002
+#: repeatedly: largest share of such steps, and that of a machine whose force does not rest on its angle, and whose speed is
+#: better than the change of an angle with late stamps as long as these are few.
+_SLIP_RAD, _SLIP_DELAY_S, _MOST_APART, _MOST_APART_BARE = 0.3, 0.01, 0.002, 0.02
 #: Travel from which the angle's derivative is compared with the speed, rad; least correlation of both; largest deviation of
 #: their ratio from 1, of which a filter's delay causes some hundredths, and from that of a unit that is then named.
 _WAY_RAD, _CORRELATED, _OTHER_SCALE, _NAMED = 1.0, 0.8, 0.1, 0.04
@@ -268,11 +269,12 @@ SUBSTITUTES = {
 }
 
 
-def fill_missing(name: str, signals: Signals) -> Signals:
-    """A message's signals, at least one, completed by substitutes for missing ones (`SUBSTITUTES`)."""
+def fill_missing(name: str, signals: Signals, bare: bool = False) -> Signals:
+    """A message's signals, at least one, completed by substitutes for missing ones (`SUBSTITUTES`); ``bare`` of a machine that
+    clamps nothing."""
     if name.endswith("_Resolver"):
         angle, speed = signals.get("MotorAngle"), signals.get("MotorSpeed")
-        if isinstance(angle, Series) and isinstance(speed, Series) and (why := _another_motion(angle, speed)):
+        if isinstance(angle, Series) and isinstance(speed, Series) and (why := _another_motion(angle, speed, bare)):
             tell(f"{name}: MotorSpeed {why}: left out, the change of the angle is taken")
             speed = None
         angle = speed.integral() if angle is None else angle
@@ -282,6 +284,12 @@ def fill_missing(name: str, signals: Signals) -> Signals:
         caliper = signals.get("CaliperTemp", _mean(plates[0], plates[-1]))
         return {"InnerBackplateTemp": plates[0], "OuterBackplateTemp": plates[-1], "CaliperTemp": caliper}
     return signals
+
+
+def filled(messages: Mapping[str, Signals]) -> dict[str, Signals]:
+    """A log's messages, each completed by `fill_missing`."""
+    bare = {f"EMB_{corner}_Resolver" for corner in CORNERS if is_bare(corner, messages)}
+    return {name: fill_missing(name, signals, name in bare) for name, signals in messages.items()}
 
 
 def standing(messages: Mapping[str, Signals], angle_rad: float) -> dict[str, Series]:
@@ -297,7 +305,7 @@ def standing(messages: Mapping[str, Signals], angle_rad: float) -> dict[str, Ser
     }
 
 
-def _another_motion(angle: Series, speed: Series) -> str:
+def _another_motion(angle: Series, speed: Series, bare: bool) -> str:
     """How speed and angle contradict each other; empty if they do not. Between sparse samples the motion is unknown, but not
     how far a speed that changes slowly goes."""
     steps = np.diff(angle.time_ns)
@@ -322,7 +330,7 @@ def _another_motion(angle: Series, speed: Series) -> str:
         return ""
     apart = np.abs(way - turned) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
     share = float(np.mean(apart[near]))
-    if share <= _MOST_APART:
+    if share <= (_MOST_APART_BARE if bare else _MOST_APART):
         return ""
     return (
         f"is another motion than the change of MotorAngle in {100.0 * share:.1f} % of the samples (stamps of a busy computer?)"
@@ -558,8 +566,12 @@ def unrepeated(speed: np.ndarray | float, row: np.ndarray | int) -> np.ndarray |
 
 
 def turns_free(corner: str, messages: Mapping[str, Signals]) -> bool:
-    """Whether a mapping states a constant load: the machine clamps nothing."""
-    return isinstance(messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef"), float | int)
+    """Whether the load is constant, as a mapping states it or a column of known weights: the machine clamps nothing. A force
+    that is 0 throughout was rather not measured."""
+    force = messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef")
+    if isinstance(force, Series):
+        return bool(len(force.values)) and force.values[0] != 0.0 and not np.ptp(force.values)
+    return isinstance(force, float | int)
 
 
 def is_bare(corner: str, messages: Mapping[str, Signals]) -> bool:

@@ -29,16 +29,22 @@ _FRAMES = (".blf", ".asc", ".trc")
 #: How columnar files and workbooks begin.
 _PARQUET, _FEATHER, _WORKBOOKS = b"PAR1", b"ARROW1", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 #: How containers of messages begin that nothing here reads.
-_BAGS = {b"#ROSBAG": "a ROS bag", b"\x89MCAP": "a ROS 2 bag", b"SQLite format 3": "a database, as ROS 2 bags are"}
+_BAGS = {
+    b"#ROSBAG": "a ROS bag", b"\x89MCAP": "a ROS 2 bag", b"SQLite format 3": "a database, as ROS 2 bags are",
+    b"\x80\x04\x95": "a pickle of Python", b"\x80\x05\x95": "a pickle of Python",
+    b"version https://git-lfs": "a pointer of Git LFS to a file that is not here",
+}  # fmt: skip
+#: Where a tar archive says that it is one, and what it says.
+_TAR_AT, _TAR = 257, b"ustar"
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Largest number of lines of text before a table's header, and of units between header and numbers.
 _PREAMBLE, _UNITS = 60, 3
 #: Share of a column's cells that may be no numbers; half of them if they are a few words, as from an instrument out of range.
 _MOST_ODD, _FEW_WORDS = 0.01, 3
-#: A time of day with parts of a second, or minutes and seconds, after a date or none; pyarrow reads ISO 8601.
+#: A time of day with parts of a second, or minutes and seconds, after a date, days or none; pyarrow reads ISO 8601.
 _CLOCK = re.compile(
-    r"(?:(?P<date>\d{1,4}[./-](?:\d{1,2}|[A-Za-z]{3})[./-]\d{1,4}),?[ T])?"
+    r"(?:(?P<date>\d{1,4}[./-](?:\d{1,2}|[A-Za-z]{3})[./-]\d{1,4}),?[ T]|(?P<days>\d+) days? )?"
     r"(?:(?P<h>\d{1,2}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,:]\d+)?)(?: ?(?P<half>[AaPp])\.?[Mm]\.?)?"
 )
 #: A number with thousands separators or a decimal comma; separators that are never decimal.
@@ -51,9 +57,11 @@ _UNIT, _DECIMAL = b"unit", b"decimal comma"
 #: Name of a column by its number.
 _BY_PLACE = re.compile(r"column ([1-9]\d*)")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
-#: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits, in its unit; how
-#: many ordinary steps may pass meanwhile.
-_CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 2**32), 10.0
+#: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits or the part of a
+#: second that stands in a column of its own (µs, ns), in its unit; how many ordinary steps may pass meanwhile.
+_CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 10**6, 10**9, 2**32), 10.0
+#: Share of the fewer rows that two columns have in common if they were written together.
+_TOGETHER = 0.5
 #: What separates a channel's name from its group, and the channel of raw frames in bus loggers' files.
 _IN_GROUP, _BUS = " group ", "CAN_DataFrame"
 #: Number of octets of which every second is zero in UTF-16 without a byte order mark.
@@ -67,6 +75,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
 #: A semicolon at the end of a line.
 _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
+#: A name in quotes of a few lines, which begins and ends a cell.
+_BROKEN = re.compile(rb'(?m)(?:(?<=[,;|\t ])|^)"[^",;|\t\n]{,50}(?:\r?\n[^",;|\t\n]{,50}){1,3}"(?=[,;|\t\r]|$)')
 #: Lines at the end of a text that do not begin with a number.
 _WORDS = re.compile(rb'(?:(?:^|\n)(?![ \t"]*[+-]?[\d.,]).*)+\Z')
 #: Cells that mean that nothing was measured.
@@ -87,7 +97,8 @@ def read_table(
     raw = read_file(path)
     ending = log_ending(path)
     content, digest = unpack(path, raw), hashlib.sha256(raw).hexdigest()
-    if bag := next((what for beginning, what in _BAGS.items() if content.startswith(beginning)), ""):
+    bag = next((what for beginning, what in _BAGS.items() if content.startswith(beginning)), "")
+    if bag := bag or ("a tar archive" if content.startswith(_TAR, _TAR_AT) else ""):
         raise InputError(f"{path}: is {bag}, which is not read; expected what it holds as CSV, Parquet or .mat")
     begins = ending_of_content(content)
     # `.dat` is the ending of INCA's measurements, and of other tools' text tables.
@@ -104,11 +115,11 @@ def read_table(
     if time.name is not None:
         table = _table(path, content, ending, [time.signal, time.name, time.value])
         parts = {name: table.filter(_named(path, table[time.name], name)) for name in names}
-        return {name: _in_time(f"{path}: {name}", part, [time.value], time) for name, part in parts.items()}, {}, digest
+        found = {name: _in_time(f"{path}: {name}", part, [time.value], time)[time.value] for name, part in parts.items()}
+        return found, {}, digest
     table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names])
-    stamps, *columns = _in_time(f"{path}", table, names, time)
     units = {field.name: field.metadata[_UNIT].decode() for field in table.schema if _UNIT in (field.metadata or {})}
-    return {name: (stamps, values) for name, values in zip(names, columns, strict=True)}, units, digest
+    return _in_time(f"{path}", table, names, time), units, digest
 
 
 def _named(path: Path, column, name: str):
@@ -123,18 +134,40 @@ def _named(path: Path, column, name: str):
     return mine
 
 
-def _in_time(source: str, table, names: list[str], time) -> tuple[np.ndarray, ...]:
+def _in_time(source: str, table, names: list[str], time) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Times (int64 ns, rising) and values of the columns with ``names``; ``source`` is what messages call them."""
-    columns = [_numbers(source, table, name) for name in names]
+    columns = {name: _numbers(source, table, name) for name in names}
     seconds = _seconds(source, table, time)
     known = np.isfinite(seconds)
     if len(seconds[known]) and (largest := float(np.max(np.abs(seconds[known])))) > LATEST_S:
         told = f"`rate_Hz`, {time.rate_Hz:g}," if time.rate_Hz else f"`time.unit`, {time.unit},"
         hint = "" if time.rate_Hz else _other_unit(largest, time)
         raise InputError(f"{source}: {time.signal}: {largest:g} s are no time; is {told} right?{hint}")
-    columns = [values[known] for values in columns]
-    stamps, rows = in_time(source, np.rint(1e9 * seconds[known]).astype(np.int64), columns)
-    return stamps, *(values[rows] for values in columns)
+    columns = {name: values[known] for name, values in columns.items()}
+    stamps = np.rint(1e9 * seconds[known]).astype(np.int64)
+    parts, found = _written_together(columns), {}
+    for part, there in parts:
+        rows = np.flatnonzero(there) if len(parts) > 1 else np.arange(len(stamps))
+        called = f"{source}: {', '.join(part)}" if len(parts) > 1 else source
+        times, kept = in_time(called, stamps[rows], [columns[name][rows] for name in part])
+        found |= {name: (times, columns[name][rows[kept]]) for name in part}
+    return found
+
+
+def _written_together(columns: dict[str, np.ndarray]) -> list[tuple[list[str], np.ndarray]]:
+    """Names of columns that have their values in the same rows, and these rows: where several senders' topics are joined into
+    one table each has rows of its own, and two of them close together are no burst."""
+    parts: list[tuple[list[str], np.ndarray]] = []
+    for name, values in columns.items():
+        there = np.isfinite(values)
+        for part, rows in parts:
+            if np.sum(rows & there) >= _TOGETHER * min(np.sum(rows), np.sum(there)):
+                part.append(name)
+                rows |= there
+                break
+        else:
+            parts.append(([name], there))
+    return parts
 
 
 def _seconds(path: str, table, time) -> np.ndarray:
@@ -190,8 +223,11 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
             table = pyarrow.feather.read_table(io.BytesIO(content))
         else:
             table = _text_table(path, _of_workbook(path, content, names), names)
-    except pyarrow.ArrowException as error:
+    except (pyarrow.ArrowException, csv.Error) as error:
         raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
+    while any(pyarrow.types.is_struct(field.type) for field in table.schema):
+        # Its fields are columns, called `struct.field`.
+        table = table.flatten()
     found = {name: _place(name, table.column_names) for name in names}
     for name, place in found.items():
         if place is None:
@@ -213,7 +249,8 @@ def _of_workbook(path: Path, content: bytes, names: list[str]) -> bytes:
         book = CalamineWorkbook.from_filelike(io.BytesIO(content))
         sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]
     except CalamineError as error:
-        raise InputError(f"{path}: not readable: {str(error).splitlines()[0]}") from None
+        text = str(error).splitlines()[0]
+        raise InputError(f"{path}: not readable as a workbook: {text}; unpack an archive first") from None
     with_names = [len({*names} & {cell for row in rows[:_PREAMBLE] for cell in row}) for rows in sheets]
     most = max(with_names, default=0)
     alike = [name for name, count in zip(book.sheet_names, with_names, strict=True) if count == most > 0]
@@ -253,8 +290,9 @@ def _column(values: np.ndarray | list):
 
 def _place(name: str, names: list[str]) -> int | None:
     """Index of a column among a table's ``names``, by name or by number; None if there is none, or several."""
-    # A blank that breaks no line looks like any other.
+    # A blank that breaks no line looks like any other, and the mark of a comment before a header is none of its first name.
     alike = [" ".join(known.split()) for known in names] if name not in names else names
+    name = name if name in alike else name.lstrip("#% ")
     if alike.count(name) == 1:
         return alike.index(name)
     place = _BY_PLACE.fullmatch(name)
@@ -263,7 +301,7 @@ def _place(name: str, names: list[str]) -> int | None:
 
 def _some(wanted: str, names: list[str]) -> str:
     """Names to list if one was misspelt: all, or the most similar ones."""
-    return ", ".join(names if len(names) <= _LISTED else [*get_close_matches(wanted, names, _LISTED, 0.0), "…"])
+    return ", ".join(names if len(names) <= _LISTED else [*get_close_matches(wanted, names, _LISTED, 0.0), "…"]) or "none"
 
 
 def _is_clock(column) -> bool:
@@ -347,7 +385,7 @@ def _number(cell: str | None, day_first: bool) -> float:
     hours, minutes, seconds = (float(re.sub("[,:]", ".", found[part] or "0")) for part in ("h", "m", "s"))
     if found["half"]:
         hours = hours % 12.0 + 12.0 * (found["half"] in "Pp")
-    of_day = 3600.0 * hours + 60.0 * minutes + seconds
+    of_day = 86400.0 * float(found["days"] or 0.0) + 3600.0 * hours + 60.0 * minutes + seconds
     if not found["date"]:
         return of_day
     parts = re.split("[./-]", found["date"])
@@ -367,7 +405,7 @@ def _text_table(path: Path, content: bytes, names: list[str]):
     content = _as_utf8(content, names)
     if b"\n" not in content:
         content = content.replace(b"\r", b"\n")
-    content = _unlabelled(_unterminated(content))
+    content = _in_one_line(_unlabelled(_unterminated(content)))
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", _PREAMBLE + _UNITS)[: _PREAMBLE + _UNITS]
     ]
@@ -462,6 +500,13 @@ def _under_one_header(path: Path, content: bytes, header: int) -> bytes:
     return b"\n".join([over, line, *above, parts[-1]])[1:]
 
 
+def _in_one_line(content: bytes) -> bytes:
+    """A table without the line breaks within its header's quotes, as spreadsheets put a unit under a name."""
+    *lines, rest = content.split(b"\n", _PREAMBLE)
+    above = _BROKEN.sub(lambda found: b" ".join(found[0].split()), b"\n".join(lines))
+    return b"\n".join([above, rest]) if lines else content
+
+
 def _are_pairs(names: list[str], rows: list[list[str]]) -> bool:
     """Whether each name stands over two columns, of which the first are the same time in each row."""
     alternate = len(names) > 2 and all(names[::2]) and not any(names[1::2])
@@ -498,6 +543,8 @@ def _with_nameless(path: Path, names: list[str], rows: list[list[str]], line: st
 def _as_utf8(content: bytes, names: list[str]) -> bytes:
     """Text as UTF-8 without a mark of byte order; what is neither UTF-8 nor UTF-16 is as older tools write it, in the letters
     in which the columns' ``names`` stand in it, and otherwise Latin-1."""
+    if content[:4] in (b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff"):
+        return content.decode("utf-32", errors="replace").encode()
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return content.decode("utf-16", errors="replace").encode()
     for first, order in ((1, "le"), (0, "be")):
@@ -582,7 +629,7 @@ def _group_and_index(path: Path, file, name: str) -> tuple[int, int]:
     if not (places := places or list(file.channels_db.get(name, ()))):
         if _BUS in file.channels_db:
             raise InputError(f"{path}: {name}: the file holds CAN frames, which a mapping with `dbc` reads")
-        known = _some(name, list(file.channels_db)) or "none"
+        known = _some(name, list(file.channels_db))
         raise InputError(f"{path}: {name}: no such channel; the measurement has {known}")
     if len(places) > 1:
         these = ", ".join(f"`{name}{_IN_GROUP}{group}`" for group, _ in places)
@@ -601,8 +648,15 @@ def _channels(path: Path, content: bytes, names: list[str]) -> tuple[dict[str, t
             start_ns = round(1e9 * file.header.start_time.timestamp())
             found, units = {}, {}
             for name in names:
-                signal = file.get(None, *_group_and_index(path, file, name))
-                values = np.asarray(signal.samples).astype(float)
+                place = _group_and_index(path, file, name)
+                signal = file.get(None, *place)
+                if signal.samples.dtype.names or signal.samples.ndim > 1:
+                    raise InputError(f"{path}: {name}: each of its samples has several values; expected a channel of one")
+                try:
+                    values = signal.samples.astype(float)
+                except ValueError:
+                    # Words stand for numbers, as of a switch.
+                    values = file.get(None, *place, raw=True).samples.astype(float)
                 stamps = start_ns + np.rint(1e9 * signal.timestamps).astype(np.int64)
                 stamps, rows = in_time(f"{path}: {name}", stamps, [values])
                 found[name], units[name] = (stamps, values[rows]), signal.unit
