@@ -19,6 +19,7 @@ from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
 from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, validation_gains
 from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
+from emb_daemon.diagnose.late_reference import earlier, reference_late_s
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
@@ -82,6 +83,7 @@ class Diagnosis:
         left: what is left, by channel.
         withdrawn: names of what the fit logs prove and confirmation took out again.
         outside: where the validation logs leave the range in which a term was found.
+        reference_late_s: time by which the reference force came after angle and current, before it was judged at its own.
     """
 
     calibration: Calibration
@@ -99,6 +101,7 @@ class Diagnosis:
     withdrawn: tuple[str, ...]
     outside: Sequence[Outside]
     seconds: float
+    reference_late_s: float = 0.0
 
     @property
     def accepted(self) -> list[Candidate]:
@@ -167,8 +170,12 @@ def diagnose(
     judges = Bench(validate, calibration) if validate else None
     for judging in filter(None, (bench, judges)):
         _refuse_silent(judging)
+    late_s = reference_late_s(bench)
+    if late_s:
+        bench = Bench(earlier(fit_logs, late_s), calibration)
+        judges = Bench(earlier(validate, late_s), calibration) if judges else None
     result = diagnose_bench(bench, judges, progress)
-    return replace(result, seconds=time.monotonic() - begin)
+    return replace(result, seconds=time.monotonic() - begin, reference_late_s=late_s)
 
 
 def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:
