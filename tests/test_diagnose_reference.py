@@ -7,7 +7,7 @@ import pytest
 from diagnosekit import drives
 
 from emb_daemon.diagnose.diagnosis import diagnose
-from emb_daemon.diagnose.late_reference import earlier, reference_late_s
+from emb_daemon.diagnose.late_reference import reference_late_s
 from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.text import verdict
@@ -43,7 +43,7 @@ def test_an_angle_of_another_time_is_no_such_reference(calibration, brake_log, l
 
 
 def test_a_reference_goes_back_to_its_own_time(brake_log):
-    [back] = earlier([_with_late_reference(brake_log, 3)], 0.012)
+    back = _with_late_reference(brake_log, 3).with_reference_earlier(0.012)
     moving = slice(100, -100)
     assert np.abs(back.force_N - brake_log.force_N)[moving].max() < 0.05 * brake_log.force_N.max()
     assert np.std((back.force_N - brake_log.force_N)[moving]) < 50.0

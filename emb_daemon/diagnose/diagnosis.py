@@ -19,7 +19,7 @@ from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
 from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, validation_gains
 from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
-from emb_daemon.diagnose.late_reference import earlier, reference_late_s
+from emb_daemon.diagnose.late_reference import reference_late_s
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
@@ -172,8 +172,8 @@ def diagnose(
         _refuse_silent(judging)
     late_s = reference_late_s(bench)
     if late_s:
-        bench = Bench(earlier(fit_logs, late_s), calibration)
-        judges = Bench(earlier(validate, late_s), calibration) if judges else None
+        fit_logs, validate = ([log.with_reference_earlier(late_s) for log in logs] for logs in (fit_logs, validate))
+        bench, judges = Bench(fit_logs, calibration), Bench(validate, calibration) if validate else None
     result = diagnose_bench(bench, judges, progress)
     return replace(result, seconds=time.monotonic() - begin, reference_late_s=late_s)
 

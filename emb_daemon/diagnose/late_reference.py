@@ -5,14 +5,12 @@ either. The current tells them apart: it bears the force of its own time, whatev
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from emb_daemon.diagnose.evidence import Evidence
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench
-from emb_daemon.offline.log import Log
 from emb_daemon.wire.contract import CYCLE_S
 
 #: Standard deviations from nothing at which a force is late beside the angle; and how far the current may be from that, in
@@ -34,13 +32,8 @@ def reference_late_s(bench: Bench) -> float:
         late_s += later_s
         if later_s < _LITTLE * CYCLE_S:
             break
-        bench = Bench(earlier(logs, late_s), bench.calibration)
+        bench = Bench([log.with_reference_earlier(late_s) for log in logs], bench.calibration)
     return late_s
-
-
-def earlier(logs: Sequence[Log], late_s: float) -> list[Log]:
-    """Logs with the reference force that came ``late_s`` after their samples."""
-    return [replace(log, force_N=np.interp(log.time_s + late_s, log.time_s, log.force_N)) for log in logs]
 
 
 def _later_s(bench: Bench) -> float:
