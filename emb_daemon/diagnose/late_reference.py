@@ -13,9 +13,10 @@ from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.wire.contract import CYCLE_S
 
-#: Standard deviations from nothing at which a force is late beside the angle; and how far the current may be from that, in
-#: standard deviations and in cycles: what a friction unlike the calibration's seems to make late, no angle confirms.
-_SURELY, _APART, _WITHIN = 5.0, 3.0, 0.6
+#: Standard deviations from nothing at which a force is late beside the angle, and from that at which the current contradicts,
+#: or this share of a cycle: what a friction unlike the calibration's seems to make late, no angle confirms. Ripples and
+#: relaxations that nothing has explained yet set the two apart by four standard deviations.
+_SURELY, _WITHIN = 5.0, 0.6
 #: Samples in the means that are compared, of which those in which friction turns over are no part.
 _SLIDING = 2
 #: A line leads to five sixths of twelve milliseconds. It is followed so often at most, until this share of a cycle is left.
@@ -51,5 +52,5 @@ def _later_s(bench: Bench) -> float:
     if not len(by_angle.values) or not len(by_current.values):
         return 0.0
     [late_s], [sigma_s], [other_s], [its_sigma_s] = by_angle.values, by_angle.sigmas, by_current.values, by_current.sigmas
-    alike = abs(late_s - other_s) < min(_APART * np.hypot(sigma_s, its_sigma_s), _WITHIN * CYCLE_S)
+    alike = abs(late_s - other_s) < min(_SURELY * np.hypot(sigma_s, its_sigma_s), _WITHIN * CYCLE_S)
     return float(late_s) if alike and late_s > _SURELY * sigma_s else 0.0
