@@ -171,7 +171,7 @@ def test_a_second_cause_is_no_shadow_of_the_largest():
 
 
 def test_what_a_bound_holds_comes_back_beside_what_else_does_its_work():
-    """Pads that soften, and a disc that grows: refitted, softening alone stands at nothing, and growth says little beside it."""
+    """Pads that soften and a disc that grows: refitted, softening alone stands at nothing, and growth says little then."""
     rng, count, length = np.random.default_rng(6), 30, 60
     soft, else_, noise = rng.normal(0.0, 1.0, (3, count * length))
     growth = -0.8 * soft + 0.2 * else_

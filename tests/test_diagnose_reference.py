@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 from diagnosekit import drives
@@ -58,3 +59,14 @@ def test_a_late_reference_makes_no_effect_and_no_other_brake(calibration):
     assert result.after.rmse("fused") < 35.0
     assert report(result)["reference_late_s"] == pytest.approx(0.0044, abs=4e-4)
     assert "The reference force comes 4.4 ms after angle and current" in verdict(result)
+
+
+@pytest.mark.trial
+def test_a_late_reference_that_a_cause_hid_is_told_beside_it(calibration):
+    """A relaxation that nobody has calibrated takes a third of it at first."""
+    effects = {name: values for name, values in calibration.effects.items() if name != "second_relaxation"}
+    known = msgspec.structs.replace(calibration, effects=effects)
+    fit_log, val_log = (_with_late_reference(log_of(frames), 1) for frames in drives(calibration, 57, {}))
+    result = diagnose([fit_log], known, [val_log])
+    assert [finding.effect.name for finding in result.accepted] == ["second_relaxation"] and result.unexplained is None
+    assert result.reference_late_s == pytest.approx(0.0044, abs=5e-4) and result.after.rmse("fused") < 35.0

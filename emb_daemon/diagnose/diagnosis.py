@@ -68,6 +68,10 @@ class Recalibrated:
         return low - _MOVED * self.sigma <= self.value <= high + _MOVED * self.sigma
 
 
+#: Time from which a reference that is later than was told at first is worth a second search, s: a quarter of a cycle.
+_LATER_S = 0.001
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """Everything that the report shows.
@@ -171,11 +175,27 @@ def diagnose(
     for judging in filter(None, (bench, judges)):
         _refuse_silent(judging)
     late_s = reference_late_s(bench)
-    if late_s:
-        fit_logs, validate = ([log.with_reference_earlier(late_s) for log in logs] for logs in (fit_logs, validate))
-        bench, judges = Bench(fit_logs, calibration), Bench(validate, calibration) if validate else None
-    result = diagnose_bench(bench, judges, progress)
+    for again in (True, False):
+        if late_s:
+            told = ([log.with_reference_earlier(late_s) for log in logs] for logs in (fit_logs, validate))
+            bench, judges = (Bench(logs, calibration) if logs else None for logs in told)
+        result = diagnose_bench(bench, judges, progress)
+        # What is found no longer hides it.
+        later_s = _later_s(result) if again else 0.0
+        if later_s < _LATER_S:
+            break
+        late_s += later_s
     return replace(result, seconds=time.monotonic() - begin, reference_late_s=late_s)
+
+
+def _later_s(result: Diagnosis) -> float:
+    """Time (s) by which the reference force is later still, by what was found; asked where something is left, or an angle was
+    found to be of a time that is still to come."""
+    delay_s = result.calibration.effects.get("signal_delay", {}).get("delay_s", 0.0)
+    if result.unexplained is None and delay_s >= 0.0:
+        return 0.0
+    in_time = moved(result.calibration, {"effects.signal_delay.delay_s": 0.0}) if delay_s < 0.0 else result.calibration
+    return reference_late_s(result.bench.under(in_time))
 
 
 def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:
