@@ -43,9 +43,10 @@ def viscous(calibration):
 
 @pytest.fixture
 def judged(viscous, monkeypatch):
-    """Diagnosis of the viscous brake, its search done once, by other validation logs."""
+    """Diagnosis of the viscous brake, its search done once, on the log as it came, by other validation logs."""
     selection, fit_log, _ = viscous
     monkeypatch.setattr(diagnosis, "select", lambda bench, progress: selection)
+    monkeypatch.setattr(diagnosis, "reference_late_s", lambda bench: 0.0)
     return lambda *validate: diagnose([fit_log], selection.model.bench.calibration, validate)
 
 
