@@ -13,13 +13,13 @@ from emb_daemon.diagnose import confirmation, diagnosis, grammar, search
 from emb_daemon.diagnose.comparison import episodes_by_log
 from emb_daemon.diagnose.coordinates import TOLERATED
 from emb_daemon.diagnose.diagnosis import Recalibrated, diagnose
-from emb_daemon.diagnose.model import LASTING, rms_known
+from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.page import page
 from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.search import select
-from emb_daemon.diagnose.selection import revise
+from emb_daemon.diagnose.selection import Selection, find_changes, revise
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline import log_of
@@ -43,9 +43,10 @@ def viscous(calibration):
 
 @pytest.fixture
 def judged(viscous, monkeypatch):
-    """Diagnosis of the viscous brake, its search done once, by other validation logs."""
+    """Diagnosis of the viscous brake, its search done once, on the log as it came, by other validation logs."""
     selection, fit_log, _ = viscous
     monkeypatch.setattr(diagnosis, "select", lambda bench, progress: selection)
+    monkeypatch.setattr(diagnosis, "reference_late_s", lambda bench: 0.0)
     return lambda *validate: diagnose([fit_log], selection.model.bench.calibration, validate)
 
 
@@ -450,3 +451,14 @@ def test_what_gave_way_to_a_term_is_kept_beside_it(monkeypatch, viscous, gave_wa
     found = select(bench, lambda text, share: None)
     assert term.name in found.accepted and ("viscous_friction" in found.accepted) != gave_way
     assert (found.instead.accepted if gave_way else found.instead) == (["viscous_friction"] if gave_way else None)
+
+
+def test_orders_of_an_uneven_disc_that_have_changed_are_said(calibration):
+    """Its eight numbers together are more than what a few stops can test, each order is not."""
+    name, orders = "disc_thickness_variation", ("order_1_cosine_um", "order_2_sine_um")
+    known = moved(calibration, {f"effects.{name}.{order}": 8.0 for order in orders})
+    log = log_of(next(drives(calibration, 43, {name: dict.fromkeys(orders, 20.0)})))
+    bench = Bench([log], known)
+    begin = Model.of(bench)
+    model = begin.refined({"stiffness"})
+    assert find_changes(Selection(model, Screening(bench, begin))).candidates[name].accepted

@@ -16,7 +16,9 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import load_campaign
 from emb_daemon.identify.campaign_file import DiscCooling
+from emb_daemon.identify.run import identify
 from emb_daemon.logs import read
+from emb_daemon.logs.columns import Decoder
 
 
 def _campaign(folder, rig, text):
@@ -228,3 +230,27 @@ def test_missing_campaign_is_refused(tmp_path):
 def test_the_report_opens_in_a_browser(identified, tmp_path):
     html = (identified[0] / "report" / "report.html").read_text()
     assert_is_drawn(html, tmp_path, plots=html.count("data-figure="))
+
+
+@pytest.mark.trial
+def test_a_late_reference_is_no_property_of_the_brake(rig, tmp_path):
+    """A sample late, it made the force uncertain by 3.7 % of it instead of 0.33, and inertia another."""
+
+    def late(path):
+        frames, digest = read.read_with_digest(path)
+        frames = frames.copy()
+        force = np.flatnonzero(frames["can_id"] == Decoder("dbc/rig.dbc").can_id("RIG_FL_Force"))
+        frames["data"][force[1:]] = frames["data"][force[:-1]]
+        return frames, digest
+
+    path = _campaign(
+        tmp_path,
+        rig,
+        "curves:\n  - {log: RIG/static/curve_6p5mm.log.gz}\nrandom:\n  - {log: RIG/static/random_6p5mm.log.gz}\n",
+    )
+    ours, theirs = (identify(load_campaign(path, how)) for how in (read.read_with_digest, late))
+    [told] = theirs.stiffness.notes
+    assert not ours.stiffness.notes and float(told.split()[4]) == pytest.approx(4.0, abs=0.4)
+    assert theirs.calibration.motor.inertia_kg_m2 == pytest.approx(ours.calibration.motor.inertia_kg_m2, rel=2e-3)
+    assert theirs.calibration.noise.stiffness_N == pytest.approx(ours.calibration.noise.stiffness_N, rel=0.2)
+    assert theirs.calibration.noise.stiffness_relative < ours.calibration.noise.stiffness_relative + 1e-3

@@ -19,6 +19,7 @@ from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
 from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, validation_gains
 from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
+from emb_daemon.diagnose.late_reference import reference_late_s
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
@@ -67,6 +68,10 @@ class Recalibrated:
         return low - _MOVED * self.sigma <= self.value <= high + _MOVED * self.sigma
 
 
+#: Time from which a reference that is later than was told at first is worth a second search, s: a quarter of a cycle.
+_LATER_S = 0.001
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """Everything that the report shows.
@@ -82,6 +87,7 @@ class Diagnosis:
         left: what is left, by channel.
         withdrawn: names of what the fit logs prove and confirmation took out again.
         outside: where the validation logs leave the range in which a term was found.
+        reference_late_s: time by which the reference force came after angle and current, before it was judged at its own.
     """
 
     calibration: Calibration
@@ -99,6 +105,7 @@ class Diagnosis:
     withdrawn: tuple[str, ...]
     outside: Sequence[Outside]
     seconds: float
+    reference_late_s: float = 0.0
 
     @property
     def accepted(self) -> list[Candidate]:
@@ -167,8 +174,28 @@ def diagnose(
     judges = Bench(validate, calibration) if validate else None
     for judging in filter(None, (bench, judges)):
         _refuse_silent(judging)
-    result = diagnose_bench(bench, judges, progress)
-    return replace(result, seconds=time.monotonic() - begin)
+    late_s = reference_late_s(bench)
+    for again in (True, False):
+        if late_s:
+            told = ([log.with_reference_earlier(late_s) for log in logs] for logs in (fit_logs, validate))
+            bench, judges = (Bench(logs, calibration) if logs else None for logs in told)
+        result = diagnose_bench(bench, judges, progress)
+        # What is found no longer hides it.
+        later_s = _later_s(result) if again else 0.0
+        if later_s < _LATER_S:
+            break
+        late_s += later_s
+    return replace(result, seconds=time.monotonic() - begin, reference_late_s=late_s)
+
+
+def _later_s(result: Diagnosis) -> float:
+    """Time (s) by which the reference force is later still, by what was found; asked where something is left, or an angle was
+    found to be of a time that is still to come."""
+    delay_s = result.calibration.effects.get("signal_delay", {}).get("delay_s", 0.0)
+    if result.unexplained is None and delay_s >= 0.0:
+        return 0.0
+    in_time = moved(result.calibration, {"effects.signal_delay.delay_s": 0.0}) if delay_s < 0.0 else result.calibration
+    return reference_late_s(result.bench.under(in_time))
 
 
 def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:

@@ -28,6 +28,7 @@ def report(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "judged_on": diagnosis.judged_on,
         "reference": "clamp_force" if diagnosis.bench.has_reference else "innovation",
+        "reference_late_s": diagnosis.reference_late_s,
         "current_late_s": diagnosis.bench.current_late_s,
         "current_dead_A": diagnosis.bench.current_dead_A,
         "effects": [_finding(diagnosis, finding) for finding in diagnosis.findings],

@@ -27,7 +27,6 @@ from emb_daemon.effects.base import OF_THE_MOTOR
 from emb_daemon.effects.terms import PORTS, SIGNALS
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
-from emb_daemon.logs.columns import nearest
 from emb_daemon.logs.contradictions import current_late_ms
 from emb_daemon.logs.resample import Series
 from emb_daemon.offline.log import Log
@@ -131,10 +130,7 @@ def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
     reference, time, force = log.reference, log.time_ns, log.force_N
     if not len(reference.time_ns) or not np.isfinite(force).any():
         return force, np.full(len(time), np.nan)
-    later = reference.time_ns[nearest(reference.time_ns, time)] - time
-    near = np.abs(later) < 2_000_000
-    offset = np.median(later[near]) if near.any() else 0.0
-    share = float(np.clip(offset / np.median(np.diff(reference.time_ns)), -0.5, 0.5))
+    share = float(np.clip(log.stamped_later_ns / np.median(np.diff(reference.time_ns)), -0.5, 0.5))
     shifted = force.copy()
     if share > 0.0:
         shifted[1:] = (1.0 - share) * force[1:] + share * force[:-1]

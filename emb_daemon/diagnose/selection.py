@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from emb_daemon.diagnose.coordinates import Coordinate, about_middle
+from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle
 from emb_daemon.diagnose.evidence import Evidence
 from emb_daemon.diagnose.model import LASTING, Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
@@ -293,13 +293,22 @@ def _try_unsure(selection: Selection, tested: list[Candidate], rivals: dict) -> 
     if name not in entered.accepted:
         return entered
     amplitudes = [c for c in entered.model.of_effect(name) if not is_shape(c)]
-    evidence = entered.model.evidence_against(dict.fromkeys(amplitudes, 0.0))
+    evidence = _against(entered.model, candidate.effect, dict.fromkeys(amplitudes, 0.0))
     chance = min(1.0, evidence.p_value * shapes * len(REGISTRY))
     if chance > Q_VALUE or evidence.gain <= 0.0:
         return entered.without(name, candidate.reason)
     gain = entered.model.rms(evidence.gain, candidate.channel)
     sure = replace(entered.candidates[name], p_value=evidence.p_value * shapes, q_value=chance, gain=gain)
     return entered.noted([sure])
+
+
+def _against(model: Model, effect: Effect, values: Values) -> Evidence:
+    """That fitted numbers of an effect stand elsewhere than at ``values``, all or those of one group: a few episodes that show
+    every order of an uneven disc cannot carry a test of all its numbers. The gain is that of all."""
+    together, every = model.evidence_against(values), groups(effect, list(values))
+    single = [model.evidence_against({c: values[c] for c in group}) for group in every] if len(every) > 1 else []
+    chances = [evidence.p_value for evidence in (together, *single)]
+    return replace(together, p_value=min(1.0, min(chances) * len(chances)))
 
 
 def revise(selection: Selection) -> Selection:
@@ -380,7 +389,7 @@ def find_changes(selection: Selection) -> Selection:
         channel = own[0].channel
         start = about_middle({c: c.start for c in own}, model.bench.middle)
         fitted = [c for c in own if c not in model.chosen]
-        evidence = model.evidence_against({c: start[c] for c in fitted})
+        evidence = _against(model, effect, {c: start[c] for c in fitted})
         gain = model.rms(evidence.gain, channel)
         changed = evidence.p_value < Q_VALUE and gain >= selection.screening.floor(model, channel)
         known = Candidate(effect, channel, tuple(fitted), evidence=evidence, in_calibration=True, accepted=changed)

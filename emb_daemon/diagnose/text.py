@@ -24,6 +24,8 @@ _TOLD = 3
 _OTHER_PADS = 0.1
 #: Share of the friction as calibrated from which what is left of it is none.
 _NO_FRICTION = 1e-6
+#: Age of a reference that is said, s: half a cycle.
+_SAID_S = 0.002
 NAMES = {
     "stiffness": "stiffness path",
     "torque": "torque path",
@@ -99,7 +101,7 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    parts = (_worse, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    parts = (_worse, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
 
@@ -107,6 +109,14 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
     """Logs that have lost by what was found, whatever the others gain."""
     logs = [f"{log} ({before:.1f} N → {after:.1f} N)" for log, before, after in diagnosis.worse]
     return [f"Worse on {', '.join(logs)}."] if logs else []
+
+
+def _late(diagnosis: Diagnosis) -> list[str]:
+    """A reference force of another time, which is no error of the brake's."""
+    late_s = diagnosis.reference_late_s
+    if late_s < _SAID_S:
+        return []
+    return [f"The reference force comes {1e3 * late_s:.1f} ms after angle and current, and is judged at its own time."]
 
 
 def _apart(diagnosis: Diagnosis) -> list[str]:

@@ -91,6 +91,7 @@ class Campaign:
     #: Logs used, by name in the campaign: SHA-256 of the file.
     sources: dict[str, str] = field(default_factory=dict)
     _logs: dict[str, Log | InputError] = field(default_factory=dict, repr=False)
+    _reference_late_s: float = 0.0
 
     @property
     def pad_thickness_mm(self) -> float:
@@ -100,6 +101,11 @@ class Campaign:
     def thickness(self, entry: Recording | Training) -> float:
         """Pad thickness of an entry in mm; the campaign's where it states none."""
         return entry.pad_thickness_mm or self.pad_thickness_mm
+
+    def move_reference(self, late_s: float) -> None:
+        """Have every log with the reference force at its own time, which came ``late_s`` after the resolver's."""
+        self._reference_late_s = late_s
+        self._logs = {name: self._in_time(log) for name, log in self._logs.items()}
 
     def fault(self, text: str) -> None:
         if text not in self.faults:
@@ -115,6 +121,10 @@ class Campaign:
                 "check scale and sign of current, force and angle"
             )
 
+    def _in_time(self, log: Log | InputError) -> Log | InputError:
+        late_s = self._reference_late_s
+        return log.with_reference_earlier(late_s) if late_s and isinstance(log, Log) else log
+
     def _read(self, name: str) -> Log:
         def read(path):
             frames, self.sources[name] = self.read(path)
@@ -122,7 +132,7 @@ class Campaign:
 
         if name not in self._logs:
             try:
-                self._logs[name] = load_log(self.path.parent / name, self.file.corner, read)
+                self._logs[name] = self._in_time(load_log(self.path.parent / name, self.file.corner, read))
             except InputError as error:
                 self._logs[name] = error
         if isinstance(found := self._logs[name], InputError):

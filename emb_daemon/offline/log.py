@@ -1,7 +1,7 @@
 """A log, read once: samples by the daemon's own pipeline, slow channels, and what reference instruments measured."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS, SAMPLE
-from emb_daemon.logs.columns import Decoder, References, crc_is_right
+from emb_daemon.logs.columns import Decoder, References, crc_is_right, nearest
 from emb_daemon.logs.read import ids_in, read_frames
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire.frames import EXTENDED, FRAME
@@ -17,6 +17,8 @@ from emb_daemon.wire.layout import CORNERS
 
 #: Samples that a pipeline takes in one call; a log is collected in pieces.
 CAPACITY = 1 << 14
+#: Time within which a reference's frame is a sample's own, ns: half a cycle.
+_NEAR_NS = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,18 @@ class Log:
     def time_s(self) -> np.ndarray:
         """Seconds since the first sample."""
         return 1e-9 * (self.time_ns - self.time_ns[0])
+
+    @cached_property
+    def stamped_later_ns(self) -> float:
+        """Time from a sample to the stamp of its reference force, ns, as a rule; 0 where none is near."""
+        times = self.reference.time_ns
+        later = times[nearest(times, self.time_ns)] - self.time_ns if len(times) else np.zeros(0)
+        near = np.abs(later) < _NEAR_NS
+        return float(np.median(later[near])) if near.any() else 0.0
+
+    def with_reference_earlier(self, late_s: float) -> "Log":
+        """The same with the reference force, which came ``late_s`` after its samples, at its own time."""
+        return replace(self, force_N=np.interp(self.time_s + late_s, self.time_s, self.force_N))
 
     @cached_property
     def slow(self) -> SlowChannels:
