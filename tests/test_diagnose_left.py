@@ -177,7 +177,7 @@ def test_what_a_bound_holds_comes_back_beside_what_else_does_its_work():
     growth = -0.8 * soft + 0.2 * else_
     left = 0.78 * soft + growth + 0.02 * noise
     episode = np.repeat(np.arange(count), length)
-    bench = SimpleNamespace(episode={"stiffness": episode}, episodes=count)
+    bench = SimpleNamespace(episode={"stiffness": episode}, episodes=count, clamps=True)
     softening = Coordinate("softening", "stiffness", 0.8, 1e-3, 10.0, (), low=0.0)
     held = Model(bench, {softening: 0.0}, {"stiffness": left}, [], columns={softening: soft})
     assert held.freed("stiffness", [growth]) == [softening] and not held.freed("stiffness", [else_])

@@ -89,9 +89,12 @@ class Model:
 
     def freed(self, channel: str, columns: Sequence[np.ndarray], samples: int = 1) -> list[Coordinate]:
         """What a bound holds and comes back from it where regressors, (N,) or (N, k) each, are fitted as well: what pads that
-        soften less than nothing would do may be done by a disc that grows and pads that soften as they did."""
+        soften less than nothing would do may be done by a disc that grows and pads that soften as they did.
+
+        Not asked of what clamps nothing: its friction is held by what drives it or by an offset of its load, and two of 36
+        recordings of such machines lost by it what holds on other logs."""
         held = [c for c in self.own(channel) if c.is_held(self.values[c])]
-        if not held:
+        if not held or not self.bench.clamps:
             return []
         every = [*held, *self.movable(channel)]
         moments = self.moments(channel, [*(self.columns[c] for c in every), *columns], samples=samples)
