@@ -29,6 +29,7 @@ from emb_daemon.diagnose.signals import Outside, outside_range
 from emb_daemon.diagnose.unexplained import Dependence, Left, dependences, is_beyond, least_dependence
 from emb_daemon.diagnose.warmth import HeatSearch, heat_bench
 from emb_daemon.effects.base import Effect
+from emb_daemon.effects.paths import known_delay
 from emb_daemon.errors import InputError
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline.levels import force_error_levels, integral_time, lasting_share
@@ -68,8 +69,9 @@ class Recalibrated:
         return low - _MOVED * self.sigma <= self.value <= high + _MOVED * self.sigma
 
 
-#: Time from which a reference that is later than was told at first is worth a second search, s: a quarter of a cycle.
-_LATER_S = 0.001
+#: Time from which a reference that is later than was told at first is worth a second search, s: a quarter of a cycle; and the
+#: parameter of an effect that is an angle's age.
+_LATER_S, _DELAY = 0.001, "delay_s"
 
 
 @dataclass(frozen=True)
@@ -191,11 +193,12 @@ def diagnose(
 def _later_s(result: Diagnosis) -> float:
     """Time (s) by which the reference force is later still, by what was found; asked where something is left, or an angle was
     found to be of a time that is still to come."""
-    delay_s = result.calibration.effects.get("signal_delay", {}).get("delay_s", 0.0)
-    if result.unexplained is None and delay_s >= 0.0:
+    found = result.calibration
+    early = known_delay(to_parameters(found)["effects"]) < 0.0
+    if result.unexplained is None and not early:
         return 0.0
-    in_time = moved(result.calibration, {"effects.signal_delay.delay_s": 0.0}) if delay_s < 0.0 else result.calibration
-    return reference_late_s(result.bench.under(in_time))
+    delays = {f"effects.{name}.{_DELAY}": 0.0 for name, values in found.effects.items() if _DELAY in values}
+    return reference_late_s(result.bench.under(moved(found, delays) if early else found))
 
 
 def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:

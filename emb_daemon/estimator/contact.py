@@ -93,7 +93,8 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     if abs(behind) > unsure and s.plausibility.still == 0 and not repeats:
         moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
     elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN and not repeats:
-        moved, sigma = (slip, _ZERO_RAD) if seen else (jump, reach)
+        # The speed of a sample that is wrong may be wrong as well.
+        moved, sigma = (slip, hypot(_ZERO_RAD, 0.5 * m.dt * (m.speed - s.speed))) if seen else (jump, reach)
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure and not repeats:
         moved, sigma = slip, _ZERO_RAD
     elif seen:

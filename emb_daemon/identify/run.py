@@ -12,14 +12,15 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.calibration import nominal, provenance, tidy
 from emb_daemon.identify.campaign import Campaign
+from emb_daemon.identify.dynamics import DELAY
 from emb_daemon.identify.steps import Step, attribution, contact, held_out, noise, stiffness, thermal, thickness, torque
 from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.validation import Validation, at_thickness, validate, validate_others, why_worse
 
 Progress = Callable[[float, str], None]
 #: Time from which the reference force is not the resolver's, s: half a cycle. Twelve rigs whose instruments are in time have
-#: up to 0.4 ms.
-_LATE_S = 0.002
+#: up to 0.4 ms. Standard deviations at which that is certain.
+_LATE_S, _SURELY = 0.002, 5.0
 
 
 @dataclass(frozen=True)
@@ -63,14 +64,17 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     stiff = stiffness.identify(pads, start)
     # What the instrument's own stamps say is no part of it.
     stamped_s = 1e-9 * float(np.median([log.stamped_later_ns for own in pads for log in own.logs]))
-    if (late_s := stiff.fit.delay_s + stamped_s) > _LATE_S:
+    late_s = stiff.fit.delay_s + stamped_s
+    # Slow logs alone do not tell it from a relaxation.
+    told = any(own.random for own in pads) and stiff.fit.delay_s > _SURELY * stiff.fit.sigmas[DELAY]
+    if told and late_s > _LATE_S:
         # Every step would put it down to the brake: to inertia, friction and the sigma of the force.
         campaign.move_reference(late_s)
         pads = thickness.load_pads(campaign)
-        told = (
+        note = (
             f"The reference force comes {1e3 * late_s:.1f} ms after the resolver: all logs are judged with it at its own time."
         )
-        stiff = replaced(stiffness.identify(pads, start), notes=(told,))
+        stiff = replaced(stiffness.identify(pads, start), notes=(note,))
     progress(0.3, "torque path")
     motor = torque.identify(campaign, pads, start)
     zero = contact.identify(stiff, sheet.resolver.count_rad, start.contact.clearance_rad)
