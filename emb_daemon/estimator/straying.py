@@ -25,11 +25,12 @@ from emb_daemon.wire.contract import CYCLE_S
 #: variance that the contact angle gains with the present sample because of what strays, rad². ``speed`` rad/s, smoothed, and
 #: ``creeps``: whether the motor may stand although its angle creeps. That of an open brake has stood for ``rest_s`` s of late,
 #: in which its angle and its integrated speed changed by ``rest_travel`` and ``rest_turned`` rad; ``rate`` rad/s: at which the
-#: zero then drifted, 0 if that is not certain, and ``drifted`` rad: so far since the last release. ``lately_…``: time and ways
-#: of the last moments, which count if it goes on to stand.
+#: zero then drifted, 0 if that is not certain, and ``drifted`` rad: so far since the last release. ``rest_begun`` rad: way of
+#: the angle in the rest's first half. ``lately_…``: time and ways of the last moments, which count if it goes on to stand.
 STRAYING = np.dtype(
     [
         *fields("f8", "share told strayed contact known gained walked speed rest_s rest_travel rest_turned rate drifted"),
+        ("rest_begun", "f8"),
         *fields("f8", "lately_s lately_travel lately_turned"),
         ("creeps", "?"),
     ],
@@ -46,6 +47,9 @@ _SMOOTHED_S, _NOISE = 0.2, 3.0
 #: Time for which a motor must stand to tell, s: the noise of the speed then leaves a drift of some hundredths of a rad/s; and
 #: standard deviations of that which what strays must reach to tell whose fault it is.
 _REST_S, _SHOWN = 2.0, 3.0
+#: Fastest drift, rad/s, as `models.wander` has it, and standard deviations of the speed's noise that chance does not reach in
+#: a rest, beyond which a sample's way is no drift; and share of its whole way by which half of a drift's differs from half.
+_FASTEST, _CHANCE, _UNSTEADY = 1.0, 6.0, 0.25
 #: Share by which a drift may change until the motor stands again; and standard deviation, as a share, of what has strayed
 #: until it was found, because nobody knows when it began.
 _CHANGES, _SINCE = 0.1, 0.3
@@ -91,11 +95,17 @@ def follow_straying(s: Record, p: Record, travel: float, turned: float, speed: f
 def _rest(s, p, travel, turned, dt):
     """Take one sample of a motor that stands."""
     a = s.straying
+    if abs(travel - turned) > COUNTS_RAD + (_FASTEST + _CHANCE * s.speed_sigma) * dt:
+        # A rotor that slips is no drift, nor is what came before and after it one rest.
+        a.rest_s = a.rest_travel = a.rest_turned = a.lately_s = a.lately_travel = a.lately_turned = 0.0
+        return
     a.lately_s += dt
     a.lately_travel += travel
     a.lately_turned += turned
     if a.lately_s < SLOWEST_S:
         return
+    if a.rest_s < 0.5 * _REST_S:
+        a.rest_begun = a.rest_travel + a.lately_travel
     a.rest_s += a.lately_s
     a.rest_travel += a.lately_travel
     a.rest_turned += a.lately_turned
@@ -109,7 +119,8 @@ def _rest(s, p, travel, turned, dt):
         take_offset(s.wander, a.rest_turned, variance, a.rest_s)
         if slip * slip > sq(_SHOWN) * variance:
             _learn_share(a, slip, a.rest_travel, variance)
-            if a.rest_travel / slip > 0.5:
+            steady = abs(a.rest_begun - 0.5 * a.rest_travel) < _UNSTEADY * abs(a.rest_travel)
+            if a.rest_travel / slip > 0.5 and steady:
                 a.rate = a.rest_travel / a.rest_s
     if a.rate != 0.0 and not known:
         _undo(s, p)
