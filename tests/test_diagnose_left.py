@@ -170,22 +170,6 @@ def test_a_second_cause_is_no_shadow_of_the_largest():
     assert not reasons[0] and "shadow of something else" in reasons[1]
 
 
-def test_what_a_bound_holds_comes_back_beside_what_else_does_its_work():
-    """Pads that soften and a disc that grows: refitted, softening alone stands at nothing, and growth says little then."""
-    rng, count, length = np.random.default_rng(6), 30, 60
-    soft, else_, noise = rng.normal(0.0, 1.0, (3, count * length))
-    growth = -0.8 * soft + 0.2 * else_
-    left = 0.78 * soft + growth + 0.02 * noise
-    episode = np.repeat(np.arange(count), length)
-    bench = SimpleNamespace(episode={"stiffness": episode}, episodes=count, clamps=True)
-    softening = Coordinate("softening", "stiffness", 0.8, 1e-3, 10.0, (), low=0.0)
-    held = Model(bench, {softening: 0.0}, {"stiffness": left}, [], columns={softening: soft})
-    assert held.freed("stiffness", [growth]) == [softening] and not held.freed("stiffness", [else_])
-    found = held.evidence("stiffness", [growth])
-    assert found.values[0] == pytest.approx(1.0, abs=0.02)
-    assert found.gain > 0.9 * float(left @ left)
-
-
 def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):
     """What the torque path leaves is current: a function of the current explains it whatever its cause."""
     gains = {"current": 900.0, "motor_acceleration": 800.0, "motor_speed": 700.0}

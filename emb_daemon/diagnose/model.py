@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
-from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out, leave_out_within, solve_within
+from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out, leave_out_within
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
@@ -86,25 +86,6 @@ class Model:
         """What no bound holds of that: what the others do a line must not put down to one that cannot go on, as a drag that
         drives or an offset of the load, which is a friction below zero where a motor turns one way."""
         return [c for c in self.own(channel) if not c.is_held(self.values[c])]
-
-    def freed(self, channel: str, columns: Sequence[np.ndarray], samples: int = 1) -> list[Coordinate]:
-        """What a bound holds and comes back from it where regressors, (N,) or (N, k) each, are fitted as well: what pads that
-        soften less than nothing would do may be done by a disc that grows and pads that soften as they did.
-
-        Not asked of what clamps nothing: its friction is held by what drives it or by an offset of its load, and two of 36
-        recordings of such machines lost by it what holds on other logs."""
-        held = [c for c in self.own(channel) if c.is_held(self.values[c])]
-        if not held or not self.bench.clamps:
-            return []
-        every = [*held, *self.movable(channel)]
-        moments = self.moments(channel, [*(self.columns[c] for c in every), *columns], samples=samples)
-        more = moments.products.shape[1] - 1 - len(every)
-        low, high = (
-            np.append([bound - self.values[c] for c, bound in zip(every, bounds, strict=True)], np.full(more, end))
-            for bounds, end in (([c.low for c in every], -np.inf), ([c.high for c in every], np.inf))
-        )
-        moved = solve_within(moments, np.append(self.penalty(every, channel), np.zeros(more)), low, high)
-        return [c for c, by in zip(held, moved, strict=False) if not c.is_held(self.values[c] + by)]
 
     def of_effect(self, name: str) -> list[Coordinate]:
         return [c for c in self.values if c.effect == name]
@@ -266,13 +247,11 @@ class Model:
         self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = (), samples: int = 1
     ) -> Evidence:
         """Of regressors that are not in the model, everything in it and ``given`` ones free; of means over ``samples``."""
-        free, freed = self.movable(channel), self.freed(channel, [*given, *own], samples)
-        moments = self.moments(channel, [*(self.columns[c] for c in (*free, *freed)), *given, *own], samples=samples)
-        penalty = np.concatenate([self.penalty([*free, *freed], channel), np.zeros(len(given) + len(own))])
-        beside = list(range(len(free) + len(freed) + len(given)))
-        without = [n for n in beside if not len(free) <= n < len(free) + len(freed)]
-        plain = leave_out(moments.select(without), penalty[without]).left_out
-        return judge(moments, beside, list(range(len(beside), len(penalty))), penalty, plain)
+        free = self.movable(channel)
+        moments = self.moments(channel, [*(self.columns[c] for c in free), *given, *own], samples=samples)
+        penalty = np.concatenate([self.penalty(free, channel), np.zeros(len(given) + len(own))])
+        first = len(free) + len(given)
+        return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
 
     def evidence_against(self, values: Values, samples: int = 1) -> Evidence:
         """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free; of means over

@@ -285,8 +285,8 @@ class Screening:
         basis = smooth_basis(name, self.signals[name], self.signals["clamp_force"])
         if not basis.shape[1]:
             return None
+        own = model.movable(channel)
         basis = basis * (model.residual[channel] != 0.0)[:, None]
-        own = [*model.movable(channel), *model.freed(channel, [*columns, basis], samples)]
         moments = model.moments(channel, [*(model.columns[c] for c in own), *columns, basis], samples=samples)
         size = np.einsum("gii->i", moments.products)[-1 - basis.shape[1] : -1]
         prior = np.append(model.penalty(own, channel), np.zeros(len(columns)))
