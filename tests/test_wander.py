@@ -6,7 +6,7 @@ import pytest
 
 from emb_daemon.estimator.contact import place_contact
 from emb_daemon.estimator.records import new_state
-from emb_daemon.estimator.straying import attribute_straying
+from emb_daemon.estimator.straying import attribute_straying, follow_straying, straying_sigma
 from emb_daemon.models.fusion import CONTACT, COULOMB, OFFSET
 from emb_daemon.models.wander import WANDER, leave_stretch, watch_wander
 from emb_daemon.offline import estimate
@@ -78,6 +78,15 @@ def _estimated(p, change, seed):
     return estimate(rows, p), force
 
 
+def _drift(rad_per_s, begin=0):
+    """Change of SAMPLE rows whose angle drifts from row ``begin`` on."""
+
+    def change(rows):
+        rows["angle"] += rad_per_s * _DT * np.maximum(np.arange(len(rows)) - begin, 0)
+
+    return change
+
+
 def _beyond(estimates, force):
     return np.abs(estimates["force"] - force) > 3.0 * np.hypot(estimates["sigma"], 25.0)
 
@@ -86,11 +95,7 @@ def _beyond(estimates, force):
 @pytest.mark.parametrize("rad_per_s", [-0.1, 0.1])
 def test_a_slow_drift_is_told_within_half_a_minute_and_covered(p, rad_per_s, seed):
     begin = 7500
-
-    def drift(rows):
-        rows["angle"] += rad_per_s * _DT * np.maximum(np.arange(len(rows)) - begin, 0)
-
-    estimates, force = _estimated(p, drift, seed)
+    estimates, force = _estimated(p, _drift(rad_per_s, begin), seed)
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and begin < told[0] < begin + 30 / _DT
     assert np.mean(estimates["source"] == r.FUSED) > 0.99
@@ -127,11 +132,7 @@ def _rmse(estimates, force):
 @pytest.mark.parametrize("rad_per_s", [-0.1, 0.1])
 def test_after_some_stops_the_contact_angle_drifts_with_the_angle(p, rad_per_s, seed):
     """Without that the filter follows with 380 to 530 N."""
-
-    def drift(rows):
-        rows["angle"] += rad_per_s * _DT * np.arange(len(rows))
-
-    estimates, force = _estimated(p, drift, seed)
+    estimates, force = _estimated(p, _drift(rad_per_s), seed)
     learned = slice(len(force) // 2, None)
     assert _rmse(estimates[learned], force[learned]) < 300.0
     assert np.mean(_beyond(estimates, force)[learned]) < 0.01
@@ -201,11 +202,7 @@ def test_an_angle_that_creeps_while_brakes_are_open_drifts_whatever_the_offset_o
     """It began before that offset could be known. Nothing turns the motor of an open brake, so that some moments of rest tell;
     by the speed alone it is never told, and followed with up to 280 N and 3 % beyond three sigma."""
     begin = 1250
-
-    def drift(rows):
-        rows["angle"] += rad_per_s * _DT * np.maximum(np.arange(len(rows)) - begin, 0)
-
-    estimates, force = _estimated(p, drift, seed)
+    estimates, force = _estimated(p, _drift(rad_per_s, begin), seed)
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
     assert len(told) and begin < told[0] < begin + 12 / _DT
     assert _rmse(estimates[begin:], force[begin:]) < 240.0
@@ -250,3 +247,69 @@ def test_a_rotor_that_slips_while_brakes_are_open_does_not_drift(p, rad_per_samp
     for first in range(0, len(rows), 250):
         estimate(rows[first : first + 250], p, state)
         assert state["straying"]["rate"][0] == 0.0
+
+
+@pytest.fixture
+def resting(p):
+    """STATE of a motor that stands beside open brakes, its speed's noise 0.35 rad/s."""
+    s = new_state()[0]
+    s["gear_slope"], s["speed_sigma"] = 1.0, 0.35
+    return s
+
+
+def _rest(s, p, rad_per_s, read_rad_per_s=0.0, seconds=2.5):
+    """Let its angle and its speed be read as changing so fast; returns the summed variance of the contact angle, rad²."""
+    walked = 0.0
+    for _ in range(round(seconds / _DT)):
+        follow_straying(s, p, rad_per_s * _DT, read_rad_per_s * _DT, read_rad_per_s, True, _DT)
+        walked += s["straying"]["walked"]
+    return float(walked)
+
+
+def test_a_drift_that_open_brakes_show_is_followed_from_where_it_began(p, resting):
+    """0.5 rad had strayed, of which nobody knows when: the contact and the teeth go with it, and three tenths are unsure."""
+    resting["wander"]["strayed"] = 0.5
+    _rest(resting, p, 0.1)
+    assert resting["straying"]["rate"] == pytest.approx(0.1, rel=1e-6)
+    for name in ("contact_angle", "gear_zero", "zero_moved"):
+        assert resting[name] == pytest.approx(0.5 + 0.1 * 0.48, abs=0.02), name
+    assert resting["covariance"][CONTACT, CONTACT] == pytest.approx(0.15**2)
+
+
+def test_the_rate_of_a_drift_may_change_by_a_tenth_until_the_motor_stands_again(p, resting):
+    _rest(resting, p, 0.1)
+    resting["straying"]["drifted"] = 0.0
+    assert _rest(resting, p, 0.1, seconds=1.0) == pytest.approx(0.01**2, rel=1e-2)
+
+
+def test_counts_go_on_to_be_lost_beside_a_drift(p, resting):
+    a = resting["straying"]
+    a["share"], a["rate"], resting["wander"]["loss"] = 0.5, 0.1, 0.01
+    follow_straying(resting, p, 2.0, 2.0, 500.0, False, _DT)
+    assert resting["contact_angle"] == pytest.approx(0.1 * _DT + 0.5 * 0.01 * 2.0)
+
+
+@pytest.mark.parametrize(("rad_per_s", "known"), [(0.0, True), (0.3, True), (0.05, False)])
+def test_what_the_speed_of_a_standing_motor_shows_is_its_offset(p, resting, rad_per_s, known):
+    """Unless the angle shows the same: then the motor may creep after all."""
+    _rest(resting, p, rad_per_s, 0.05)
+    wander = resting["wander"]
+    assert (wander["offset_weight"] > 0.0) == known
+    assert not known or wander["offset_sum"] / wander["offset_weight"] == pytest.approx(-0.05)
+
+
+def test_a_motion_that_a_late_speed_does_not_show_yet_is_no_drift(p, resting):
+    for _ in range(8):
+        _rest(resting, p, 0.0, seconds=0.4)
+        for _ in range(2):
+            follow_straying(resting, p, 0.008, 0.0, 0.0, True, _DT)
+        follow_straying(resting, p, 0.2, 0.2, 50.0, False, _DT)
+        resting["straying"]["speed"], resting["straying"]["creeps"] = 0.0, True
+    assert resting["straying"]["told"] == 0.0 and resting["straying"]["rest_travel"] == 0.0
+
+
+def test_what_strays_counts_by_what_is_not_known_of_its_share(resting):
+    resting["wander"]["rate"] = -0.1
+    assert straying_sigma(resting, 10.0) == pytest.approx(0.5)
+    resting["straying"]["told"] = 96.0
+    assert straying_sigma(resting, 10.0) == pytest.approx(0.1)

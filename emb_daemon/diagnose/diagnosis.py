@@ -44,6 +44,9 @@ _OVERSTATED = 3.0
 _TRADE = 0.9
 #: Standard deviations from which a base parameter counts as moved.
 _MOVED = 2.0
+#: Time from which a reference that is later than was told at first is worth a second search, s: a quarter of a cycle; and the
+#: parameter of an effect that is an angle's age.
+_LATER_S, _DELAY = 0.001, "delay_s"
 
 
 @dataclass(frozen=True)
@@ -67,11 +70,6 @@ class Recalibrated:
             return True
         low, high = sorted((self.before / self.tolerated, self.before * self.tolerated))
         return low - _MOVED * self.sigma <= self.value <= high + _MOVED * self.sigma
-
-
-#: Time from which a reference that is later than was told at first is worth a second search, s: a quarter of a cycle; and the
-#: parameter of an effect that is an angle's age.
-_LATER_S, _DELAY = 0.001, "delay_s"
 
 
 @dataclass(frozen=True)

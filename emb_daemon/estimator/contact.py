@@ -53,7 +53,7 @@ _SPEED_GAIN = 0.02
 #: of a motor that stands, one in a hundred.
 _REPEATED = 3
 #: Samples for which the angle has stood, from which the motor does: it turns by less than 0.4 rad/s.
-_STOOD = 3
+_STANDS = 3
 #: Standard deviations of the contact angle, rad, below which it is known again, and of an unknown one.
 _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: Largest torque of a released brake, as a share of what the largest force needs: the offset of an ordinary current sensor;
@@ -286,7 +286,7 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
     age_level(c, offset_walk(p, s.offset_walk) * m.dt, sigma)
     unsure = hypot(offset_sigma, learned_sigma)
-    turns = s.plausibility.held < _STOOD
+    turns = s.plausibility.held < _STANDS
     found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, contact_sigma, offset, unsure, turns)
     # If a change explains the torque, the contact angle is not moved for the same reason.
     explained = likely_shift(s) != 0.0

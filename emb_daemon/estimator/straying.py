@@ -76,11 +76,11 @@ def follow_straying(s: Record, p: Record, travel: float, turned: float, speed: f
     else:
         # The motor has begun to turn, and a late speed may not have shown it at once.
         a.lately_s = a.lately_travel = a.lately_turned = 0.0
-    strays = w.drift * dt + w.loss * abs(travel)
+    drifts, lost = a.rate * dt, w.loss * abs(travel)
+    strays = w.drift * dt + lost
     a.strayed += strays
-    drifts = a.rate * dt
     a.drifted += drifts
-    shift_zero(s, drifts if drifts != 0.0 else a.share * strays)
+    shift_zero(s, drifts + a.share * lost if drifts != 0.0 else a.share * strays)
     # The share is the same all the time, so that its error adds up.
     variance = 2.0 * sq(_CHANGES) * a.drifted * drifts if drifts != 0.0 else 2.0 * _variance(a) * a.strayed * strays
     a.walked = (max(variance, 0.0) + w.unseen * w.unseen) * sq(s.gear_slope)

@@ -200,8 +200,8 @@ def hold(
     friction_sigma: float, load_sigma: float, presliding_angle: float,
 ) -> int:  # fmt: skip
     """How often the motor must have turned although the angle stands: number of times that the smoothed torque rose or fell by
-    more than friction at rest carries in both directions under a clamp force of ``force`` N, as far as friction turns over
-    within that angle. A single swing may be an offset of the current, a swing back cannot.
+    more than friction at rest carries in both directions under a clamp force of ``force`` N, as far as what the load adds to
+    it turns over within that angle. A single swing may be an offset of the current, a swing back cannot.
 
     Standard deviations, N m: ``sigma`` of the smoothed torque by its noise, ``friction_sigma`` of the friction, ``load_sigma``
     of what the load changes by while the motor stands; ``presliding_angle`` rad."""
