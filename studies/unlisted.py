@@ -292,6 +292,27 @@ def spikes(rng, moments, size):
     return Fault(f"{told}, {100 * share:.1f} %, {reach:.1f}", at, bus=during(alter(slot, column, change), at))
 
 
+@_family
+def garbled(rng, moments, size):
+    """Whole messages of a sensor say anything, a few in a row, now and then."""
+    told, (slot, columns) = _draw_loose(rng)
+    share, length, at = draw_size(rng, 0.0005, 0.02), int(rng.integers(1, 4)), moments["go_1"]
+    reach, seed = (100.0 if told == "current" else 1000.0) * draw_size(rng, 0.01, 1.0), int(rng.integers(2**32))
+
+    def garble(column):
+        # The same messages for each of their signals, with another value.
+        when, what = np.random.default_rng(seed), np.random.default_rng((seed, column))
+
+        def change(values, _):
+            hit = np.convolve(when.random(len(values)) < share / length, np.ones(length))[: len(values)] > 0.0
+            return values + hit * reach * what.uniform(-1.0, 1.0)
+
+        return alter(slot, column, change)
+
+    fault = during(chain(*map(garble, columns)), at)
+    return Fault(f"{told}, {100 * share:.2f} % in runs of {length}, {reach:.1f}", at, bus=fault)
+
+
 def _draw_loose(rng) -> tuple[str, tuple]:
     told = str(rng.choice(list(_LOOSE)))
     return told, _LOOSE[told]

@@ -228,6 +228,24 @@ def test_resolver_that_has_slipped_on_its_shaft_is_covered_as_soon_as_the_motor_
     assert np.any(estimates["reasons"][during] & r.PATHS_DISAGREE) and _recovered(estimates, force)
 
 
+@pytest.mark.parametrize(("times", "wheel_turns", "stuck"), [(2.9, False, False), (3.25, True, False), (3.25, False, True)])
+def test_a_torque_that_friction_or_an_uneven_disc_may_hold_swings_beside_a_standing_angle(times, wheel_turns, stuck):
+    """Once a second, by so many ``times`` the dry friction to either side. Breakaway takes 1.3 of it, what friction may be
+    beyond its calibration up to 2.9; a disc that turns may be uneven and carry some more."""
+    calibration = load_calibration(resource("config/calibration.yaml"))
+    dry_A = calibration.friction.offset_Nm / calibration.motor.torque_constant_Nm_per_A
+
+    def swing(samples):
+        held = samples[HOLDING:BEFORE_RELEASE]
+        held["angle"] = held["angle"][0]
+        held["current_q"] += times * dry_A * np.sin(2.0 * np.pi * 0.004 * np.arange(len(held)))
+        if not wheel_turns:
+            samples["wheel_speed"] = 0.0
+
+    estimates, _ = city.changed(swing)
+    assert np.any(estimates["reasons"][HOLDING:BEFORE_RELEASE] & r.STUCK) == stuck
+
+
 def test_resolver_that_stands_still_with_noise_is_no_fault():
     """A motor at rest may read the same angle for ever, as long as its speed reads zero."""
     samples, _ = drive()

@@ -17,7 +17,9 @@ from emb_daemon.models.plausibility import (
     force_of_torque_alone,
     frozen,
     hold,
+    smoothed_sigma,
     stands,
+    steady,
     watch,
 )
 
@@ -243,6 +245,18 @@ def test_a_swing_is_none_that_unknown_friction_or_an_uneven_disc_may_be():
     """Three standard deviations each, of friction in both directions."""
     assert _swings([0.0, 0.435], friction_sigma=0.02) == 0 and _swings([0.0, 0.445], friction_sigma=0.02) == 1
     assert _swings([0.0, 0.345], load_sigma=0.01) == 0 and _swings([0.0, 0.355], load_sigma=0.01) == 1
+
+
+def test_the_smoothed_torque_of_first_order_noise_has_the_standard_deviation_that_is_said():
+    rng, c = np.random.default_rng(1), np.zeros(1, PLAUSIBILITY)
+    sigma, correlation_time = 0.05, 0.02
+    stays = np.exp(-_DT / correlation_time)
+    noise, seen = 0.0, []
+    for _ in range(50_000):
+        noise = stays * noise + sigma * np.sqrt(1.0 - stays**2) * rng.standard_normal()
+        steady(c[0], 0.3 + noise, 0.0, _DT)
+        seen.append(c["steady"][0])
+    assert np.std(seen[100:]) == pytest.approx(smoothed_sigma(sigma, correlation_time), rel=0.1)
 
 
 def test_frozen_is_one_sensor_that_repeats_while_the_other_goes_on():

@@ -33,18 +33,67 @@ def test_an_angle_that_jumps_without_speed_moves_the_zero_and_not_the_force(begi
     assert not np.any((np.abs(estimates["force"] - force) > 4.0 * estimates["sigma"]) & (estimates["reasons"] == 0))
 
 
-def test_teeth_stay_where_they_are_when_the_zero_moves():
+def _as_effect(calibration, ripple):
+    return {"effects": {**calibration.effects, "gear_mesh_ripple": ripple}}
+
+
+def _as_term(calibration, ripple):
+    turn = {"scale": 1.0 / ripple["order_per_turn"], "centre": 0.0, "low": -1e4, "high": 1e4}
+    named = {"name": "term:teeth", "port": "gear_gain", "signal": "motor_angle", "shape": "harmonic"}
+    return {"terms": [named | turn | {"coefficient": ripple["cosine"], "sine": ripple["sine"]}]}
+
+
+@pytest.mark.parametrize("begin", [city.RELEASED, city.CLAMPING, city.HOLDING, city.BEFORE_RELEASE, city.SECOND_CLEARANCE])
+@pytest.mark.parametrize(
+    ("angle_rad", "speed_rad_per_s", "count"),
+    [
+        (11.0, 500.0, 1),
+        (-1.0, 500.0, 1),
+        (0.2, 500.0, 1),
+        (0.0, -500.0, 1),
+        (0.0, 100.0, 1),
+        (11.0, 50.0, 1),
+        (11.0, 500.0, 3),
+    ],
+)
+def test_samples_that_no_motor_turns_to_leave_nothing_behind(begin, angle_rad, speed_rad_per_s, count):
+    """One that is wrong altogether had moved the zero by 2 rad, and the force by 3.6 kN without a word."""
+
+    def change(samples):
+        wrong = samples[begin : begin + count]
+        wrong["angle"] += angle_rad
+        wrong["speed"] += speed_rad_per_s
+
+    estimates, force = city.changed(change)
+    good, _ = city.changed()
+    assert np.all(estimates["reasons"][begin : begin + count] & (r.OUTSIDE_RANGE | r.OUT_OF_RANGE))
+    assert abs(estimates["contact_angle"] - good["contact_angle"])[begin + count :].max() < 0.15
+    assert np.all(np.abs(estimates["force"] - force) < 3.5 * estimates["sigma"])
+    assert estimates["sigma"][-1] < 2.0 * good["sigma"][-1]
+
+
+def test_a_speed_that_is_wrong_for_good_is_said_and_covered():
+    def change(samples):
+        samples["speed"][city.CLAMPING :] = 1000.0
+
+    estimates, force = city.changed(change)
+    assert np.all(estimates["reasons"][city.CLAMPING :] & r.OUTSIDE_RANGE)
+    assert np.all(np.abs(estimates["force"] - force) < 3.5 * estimates["sigma"])
+
+
+@pytest.mark.parametrize("known_as", [_as_effect, _as_term])
+def test_teeth_stay_where_they_are_when_the_zero_moves(known_as):
     """A mesh ripple of 6 % is known by its place on the shaft. With the angle as it is read it would be another one, and the
     rest of the drive went from 27 to 334 N."""
     calibration = load_calibration(resource("config/calibration.yaml"))
-    ripple = {"gear_mesh_ripple": {"cosine": 0.06, "sine": 0.0, "order_per_turn": 9.5}}
-    log = log_of(next(drives(calibration, 3, ripple)))
-    known = msgspec.convert(msgspec.to_builtins(calibration) | {"effects": {**calibration.effects, **ripple}}, Calibration)
+    ripple = {"cosine": 0.06, "sine": 0.0, "order_per_turn": 9.5}
+    log = log_of(next(drives(calibration, 3, {"gear_mesh_ripple": ripple})))
+    known = msgspec.convert(msgspec.to_builtins(calibration) | known_as(calibration, ripple), Calibration)
     begin, samples = len(log.samples) // 4, log.samples.copy()
     samples["angle"][begin:] -= 10.96
     rows = slice(begin, None)
     good, moved = (_rmse(estimate(each, to_parameters(known)), log.force_N, rows) for each in (log.samples, samples))
-    assert moved < good + 15.0
+    assert good < 40.0 and moved < good + 15.0
 
 
 @pytest.mark.parametrize("seed", range(4))

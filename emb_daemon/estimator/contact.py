@@ -67,6 +67,31 @@ _CLAMPED = 0.1
 
 
 @njit
+def _jumps(s, p, m):
+    """Whether the angle has changed by more than the motor can turn, how far (rad) that is since the angle was last right, and
+    whether it has been frozen."""
+    frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
+    reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
+    jumps = abs(m.angle - s.angle) > SPEED_MARGIN * reach + _ANGLE_MARGIN
+    return jumps, reach, s.plausibility.still > 1 or frozen_s > 0.0
+
+
+@njit
+def believe_speed(s: Record, p: Record, m: Record) -> None:
+    """Replace the speed of a sample that may be wrong altogether: its angle jumps, or no torque causes its speed within a
+    cycle, driving or braking with what holds the largest force. The last speed goes on, unless the angle says the same as this
+    one; if the last one was wrong, too, the angle tells the speed."""
+    possible = 2.0 * p.gear_gain * p.maximum_force / p.inertia * m.dt
+    was_wrong, s.speed_wrong = s.speed_wrong, False
+    if not 0.0 < m.dt <= ONE_CYCLE_S or (abs(m.speed - s.speed) <= possible and not _jumps(s, p, m)[0]):
+        return
+    by_angle = (m.angle - s.angle) / m.dt
+    if abs(m.speed - by_angle) > possible:
+        s.speed_wrong = True
+        m.speed = by_angle if was_wrong and abs(by_angle - s.speed) <= possible else s.speed
+
+
+@njit
 def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     """Whether the resolver's zero has moved, because its angle changed without a motion by the speed, which has ``turned`` rad
     since the last sample; the contact angle is moved with it.
@@ -77,9 +102,7 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     speed goes on has lost nothing unless it goes on from there.
     """
     jump = m.angle - s.angle
-    frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
-    stuck = s.plausibility.still > 1 or frozen_s > 0.0
-    reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
+    jumps, reach, stuck = _jumps(s, p, m)
     moved, sigma = 0.0, 0.0
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
     slip = jump - turned
@@ -92,9 +115,8 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     repeats = s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind))
     if abs(behind) > unsure and s.plausibility.still == 0 and not repeats:
         moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
-    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN and not repeats:
-        # The speed of a sample that is wrong may be wrong as well.
-        moved, sigma = (slip, hypot(_ZERO_RAD, 0.5 * m.dt * (m.speed - s.speed))) if seen else (jump, reach)
+    elif jumps and not repeats:
+        moved, sigma = (slip, _ZERO_RAD) if seen else (jump, reach)
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure and not repeats:
         moved, sigma = slip, _ZERO_RAD
     elif seen:
@@ -282,7 +304,9 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
     load = mean_force + s.spring_force
     to_torque(h, leverage, slope, s.friction_mean, load, speed, slow, accelerating, needed, s.winding, s.housing)
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
-    torque -= learned
+    # No force needs more; a single sample beyond it then stays a fifteenth of what counts as a clamp.
+    largest = leverage * p.maximum_force
+    torque = min(max(torque - learned, -largest), largest)
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])
     age_level(c, offset_walk(p, s.offset_walk) * m.dt, sigma)
     unsure = hypot(offset_sigma, learned_sigma)

@@ -102,6 +102,8 @@ STATE = np.dtype(
         # Angle (rad) gone beyond the integrated speed since the motor last stood, that integral, and the time for which it
         # turned, s; the first is no number where part of the way was not seen. Way by which an angle that repeats is behind.
         *fields("f8", "strayed turned turned_s behind"),
+        # Whether the speed of the last sample was not the motor's; ``speed`` is what was believed instead.
+        ("speed_wrong", "?"),
         *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),
         # Of a gear that is not constant: resolver's angle at its released position, rad, and its slope (`models.gear`). The
         # contact angle and what is past it are equivalent angles.

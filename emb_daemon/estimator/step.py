@@ -10,7 +10,15 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.common import forget_common, weigh_common
-from emb_daemon.estimator.contact import SPEED_MARGIN, at_rest, follow_zero, place_contact, seek_release, watch_contact
+from emb_daemon.estimator.contact import (
+    SPEED_MARGIN,
+    at_rest,
+    believe_speed,
+    follow_zero,
+    place_contact,
+    seek_release,
+    watch_contact,
+)
 from emb_daemon.estimator.force_sensor import with_sensor
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
@@ -146,11 +154,14 @@ def _advance(s, p, m, angle, speed, out):
     """`step` with current and motion of one moment; ``angle`` and ``speed`` as they came."""
     if not s.started:
         _start(s, p, m)
+    believe_speed(s, p, m)
     turned = way_beside(s.lately, m.angle - s.angle, m.speed, s.speed, effects.known_delay(p.effects), m.dt)
     moved_zero = follow_zero(s, p, m, turned)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         sigma = sqrt(s.covariance[CONTACT, CONTACT])
-        watch(s.plausibility, m, s.angle, s.speed, turned, s.past_contact, sigma, s.contact.confirmed)
+        # What stands in for a speed does not flicker.
+        before = np.nan if s.speed_wrong else s.speed
+        watch(s.plausibility, m, s.angle, before, turned, s.past_contact, sigma, s.contact.confirmed)
     other_speed = _follow_age(s, p, m, turned, moved_zero)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
@@ -282,7 +293,7 @@ def _look(s, p, m, facts, out):
     at_bound = s.scale * (1.0 - unsure) <= LEAST_SCALE or s.scale * (1.0 + unsure) >= MOST_SCALE
     if more > 1.0 or at_bound or max(abs(s.creep[0]), abs(s.creep[1])) >= MOST_CREEP:
         facts |= BOUND_REACHED
-    if out.force > p.maximum_force or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
+    if out.force > p.maximum_force or s.speed_wrong or abs(m.speed) > SPEED_MARGIN * p.maximum_speed:
         facts |= BEYOND_RANGE
     # A frozen current gives no bounds. Otherwise current or estimate is wrong, and sigma covers the difference.
     if contradicts(s.monitor, out.force, out.sigma, m.dt) and not facts & CURRENT_IMPLAUSIBLE:

@@ -33,6 +33,8 @@ NOTHING, TOO_LATE, TOO_EARLY = range(3)
 #: Torque (standard deviations of one sample) that is subtracted from a sum with each sample, and logarithm of the mean number
 #: of samples between false alarms: an hour of closing has 1e6 samples.
 _DRIFT, _LOG_RUN = 0.45, 17.0
+#: Share of the alarm threshold that one sample adds at most, so that none raises an alarm alone.
+_OF_ONE = 0.6
 #: Friction state from which the torque counts: friction must have developed in the closing direction.
 _TURNED_OVER = 0.9
 #: Samples from which the clearance level may raise an alarm, and over which it averages at most.
@@ -109,9 +111,10 @@ def watch_closing(
         state.samples = min(state.samples + 1.0, _MOST)
         state.level += (torque - state.level) / state.samples
     above, tolerated = torque - predicted - level, _TOLERANCE * predicted + level_sigma
+    most = _OF_ONE * limit
     if (state.samples >= _LEAST and turns) or not clear:
-        state.rise = max(0.0, state.rise + (above - tolerated) / sigma - _DRIFT)
-    state.shortfall = max(0.0, state.shortfall - (above + tolerated) / sigma - _DRIFT)
+        state.rise = max(0.0, state.rise + min((above - tolerated) / sigma - _DRIFT, most))
+    state.shortfall = max(0.0, state.shortfall + min(-(above + tolerated) / sigma - _DRIFT, most))
     if state.rise > limit:
         state.rise, state.agreed = 0.0, 0
         if state.begun >= _BEGUN and state.early > _AT_ONCE * state.excess:
