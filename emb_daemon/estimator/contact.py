@@ -38,6 +38,8 @@ SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
 #: Standard deviations of the speed's noise that are certain; and time after which a zero that drifted counts as healed, s: a
 #: car that stands once in a minute shows it.
 _CERTAIN, _DRIFTING_S = 6.0, 60.0
+#: Time within which a zero that comes back had never moved, s: some messages; and standard deviations that tell both.
+_AWAY_S, _SURELY = 0.05, 3.0
 #: From one standstill to the next angle and integrated speed must agree, whatever their delay. A standstill must last for
 #: twice the longest delay that a calibration may state, s.
 _AT_REST_S = 0.1
@@ -67,23 +69,12 @@ _CLAMPED = 0.1
 
 
 @njit
-def _jumps(s, p, m):
-    """Whether the angle has changed by more than the motor can turn, how far (rad) that is since the angle was last right, and
-    whether it has been frozen."""
-    frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
-    reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
-    jumps = abs(m.angle - s.angle) > SPEED_MARGIN * reach + _ANGLE_MARGIN
-    return jumps, reach, s.plausibility.still > 1 or frozen_s > 0.0
-
-
-@njit
 def believe_speed(s: Record, p: Record, m: Record) -> None:
-    """Replace the speed of a sample that may be wrong altogether: its angle jumps, or no torque causes its speed within a
-    cycle, driving or braking with what holds the largest force. The last speed goes on, unless the angle says the same as this
-    one; if the last one was wrong, too, the angle tells the speed."""
+    """Replace a speed that no torque causes within a cycle, driving or braking with what holds the largest force. The last
+    speed goes on, unless the angle says the same as this one; if the last one was wrong, too, the angle tells the speed."""
     possible = 2.0 * p.gear_gain * p.maximum_force / p.inertia * m.dt
     was_wrong, s.speed_wrong = s.speed_wrong, False
-    if not 0.0 < m.dt <= ONE_CYCLE_S or (abs(m.speed - s.speed) <= possible and not _jumps(s, p, m)[0]):
+    if not 0.0 < m.dt <= ONE_CYCLE_S or abs(m.speed - s.speed) <= possible:
         return
     by_angle = (m.angle - s.angle) / m.dt
     if abs(m.speed - by_angle) > possible:
@@ -102,7 +93,9 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     speed goes on has lost nothing unless it goes on from there.
     """
     jump = m.angle - s.angle
-    jumps, reach, stuck = _jumps(s, p, m)
+    frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
+    stuck = s.plausibility.still > 1 or frozen_s > 0.0
+    reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
     moved, sigma = 0.0, 0.0
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
     slip = jump - turned
@@ -115,8 +108,9 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     repeats = s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind))
     if abs(behind) > unsure and s.plausibility.still == 0 and not repeats:
         moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
-    elif jumps and not repeats:
-        moved, sigma = (slip, _ZERO_RAD) if seen else (jump, reach)
+    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN and not repeats:
+        # The speed of a sample that is wrong may be wrong as well.
+        moved, sigma = (slip, hypot(_ZERO_RAD, 0.5 * m.dt * (m.speed - s.speed))) if seen else (jump, reach)
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure and not repeats:
         moved, sigma = slip, _ZERO_RAD
     elif seen:
@@ -128,6 +122,7 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     if moved != 0.0 or not seen:
         # A motion that was not observed completely cannot be checked at its end.
         s.strayed = np.nan
+    s.away_s += m.dt
     if moved != 0.0:
         _move_zero(s, p, moved, sigma)
     return moved != 0.0
@@ -189,8 +184,24 @@ def _drift(s, m, slip, turned):
 def _move_zero(s, p, moved, sigma):
     """Refer all stored angles to a zero that has moved by ``moved`` rad, known with standard deviation ``sigma`` rad."""
     s.drifted = s.stood_s = 0.0
-    shift_zero(s, moved)
     sigma *= s.gear_slope
+    before = s.covariance[CONTACT, CONTACT]
+    if s.away_s > _AWAY_S:
+        s.away = s.away_variance = s.away_s = 0.0
+        s.known_before = before
+    went = s.away
+    s.away += moved
+    s.away_variance += sigma * sigma
+    if abs(s.away) < _SURELY * sqrt(s.away_variance) < abs(went):
+        # Messages were wrong: zero and contact angle are where they were, and known as well.
+        shift_zero(s, -went)
+        s.away_s = 1e9
+        known = min(sqrt(s.known_before / before), 1.0)
+        for i in range(STATES):
+            s.covariance[CONTACT, i] *= known
+            s.covariance[i, CONTACT] *= known
+        return
+    shift_zero(s, moved)
     s.covariance[CONTACT, CONTACT] += sigma * sigma
     open_again(s, p)
     s.contact.confirmed = False

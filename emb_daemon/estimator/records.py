@@ -102,6 +102,8 @@ STATE = np.dtype(
         # Angle (rad) gone beyond the integrated speed since the motor last stood, that integral, and the time for which it
         # turned, s; the first is no number where part of the way was not seen. Way by which an angle that repeats is behind.
         *fields("f8", "strayed turned turned_s behind"),
+        # Way (rad) by which the zero has moved since ``away_s`` s, its variance (rad2), and that of the contact angle before.
+        *fields("f8", "away away_variance away_s known_before"),
         # Whether the speed of the last sample was not the motor's; ``speed`` is what was believed instead.
         ("speed_wrong", "?"),
         *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),

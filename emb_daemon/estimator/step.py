@@ -106,7 +106,7 @@ def _start(s, p, m):
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
-    s.torque_age = s.no_current_s = 1e9
+    s.torque_age = s.no_current_s = s.away_s = 1e9
     open_all(s, p)
     forget_common(s)
     if s.resumed:
