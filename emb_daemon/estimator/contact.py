@@ -196,7 +196,7 @@ def _move_zero(s, p, moved, sigma):
         # Messages were wrong: zero and contact angle are where they were, and known as well.
         shift_zero(s, -went)
         s.away_s = 1e9
-        known = min(sqrt(s.known_before / before), 1.0)
+        known = sqrt(s.known_before / before) if before > s.known_before else 1.0
         for i in range(STATES):
             s.covariance[CONTACT, i] *= known
             s.covariance[i, CONTACT] *= known
