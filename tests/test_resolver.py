@@ -79,6 +79,7 @@ def test_a_speed_that_is_wrong_for_good_is_said_and_covered():
 
     estimates, force = city.changed(change)
     assert np.all(estimates["reasons"][city.CLAMPING :] & r.OUTSIDE_RANGE)
+    assert _rmse(estimates, force, slice(city.CLAMPING, None)) < 60.0
     assert np.all(np.abs(estimates["force"] - force) < 3.5 * estimates["sigma"])
 
 
