@@ -73,6 +73,20 @@ def test_samples_that_no_motor_turns_to_leave_nothing_behind(begin, angle_rad, s
     assert estimates["sigma"][-1] < 2.0 * good["sigma"][-1]
 
 
+@pytest.mark.parametrize(("samples_away", "known"), [(5, True), (100, False)])
+def test_a_zero_that_comes_back_had_never_moved_if_it_does_so_within_some_messages(samples_away, known):
+    begin = city.HOLDING
+    back = begin + samples_away
+
+    def change(samples):
+        samples["angle"][begin:back] += 1.5
+
+    estimates, _ = city.changed(change)
+    good, _ = city.changed()
+    assert (estimates["contact_sigma"][back] < 1.01 * good["contact_sigma"][back]) == known
+    assert estimates["reasons"][back] & r.OUT_OF_RANGE
+
+
 def test_a_speed_that_is_wrong_for_good_is_said_and_covered():
     def change(samples):
         samples["speed"][city.CLAMPING :] = 1000.0
