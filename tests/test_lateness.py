@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import fuse, restart, step
-from emb_daemon.estimator.contact import follow_zero
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.records import SAMPLE, new_state
+from emb_daemon.estimator.resolver import follow_zero
 from emb_daemon.estimator.status import ANGLE_LATE
 from emb_daemon.models.lateness import (
     LATELY,

@@ -4,8 +4,8 @@ import brake
 import numpy as np
 import pytest
 
-from emb_daemon.estimator.contact import follow_zero
 from emb_daemon.estimator.records import SAMPLE, new_state
+from emb_daemon.estimator.resolver import follow_zero
 from emb_daemon.models.plausibility import watch
 from emb_daemon.offline import estimate
 

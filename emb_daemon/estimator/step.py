@@ -10,21 +10,14 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.common import forget_common, weigh_common
-from emb_daemon.estimator.contact import (
-    SPEED_MARGIN,
-    at_rest,
-    believe_speed,
-    follow_zero,
-    place_contact,
-    seek_release,
-    watch_contact,
-)
+from emb_daemon.estimator.contact import place_contact, seek_release, watch_contact
 from emb_daemon.estimator.force_sensor import with_sensor
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
 from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
+from emb_daemon.estimator.resolver import SPEED_MARGIN, at_rest, believe_speed, follow_zero
 from emb_daemon.estimator.rewind import go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,

@@ -1,0 +1,185 @@
+"""The motor's angle and speed of one corner: a resolver whose zero jumps or drifts, whose angle stays behind, or of which some
+messages are wrong."""
+
+from math import sqrt
+
+import numpy as np
+
+from emb_daemon.estimator.hypotheses import open_again
+from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, shift_zero
+from emb_daemon.jit import Record, hypot, njit
+from emb_daemon.models.fusion import CONTACT, STATES
+from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
+
+#: A speed beyond the motor's maximum by this factor (overspeed of IEC 60034-1), and an angle by this many rad more (half of
+#: what a contact angle jumps by at once), is no motion.
+SPEED_MARGIN = 1.2
+_ANGLE_MARGIN = 0.5
+#: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
+#: this many seconds between both: 12 turns a second without speed. Standard deviation of such a jump, rad.
+SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
+#: Standard deviations of the speed's noise that are certain; and time after which a zero that drifted counts as healed, s: a
+#: car that stands once in a minute shows it.
+_CERTAIN, _DRIFTING_S = 6.0, 60.0
+#: Time within which a zero that comes back had never moved, s: some messages; and standard deviations that tell both.
+_AWAY_S, _SURELY = 0.05, 3.0
+#: From one standstill to the next angle and integrated speed must agree, whatever their delay. A standstill must last for
+#: twice the longest delay that a calibration may state, s.
+_AT_REST_S = 0.1
+#: Longest part of a standstill that counts towards the next motion, s: in it the speed's offset adds a fifth of `_ZERO_RAD`.
+_STOOD_S = 1.0
+#: Relative error of the integrated speed: a step of the acceleration a within a cycle T puts the trapezoid off by up to a
+#: T²/8, and four of them on a travel a t², sped up for t and slowed down for as long, by T²/(2 t²) of it, t being 40 ms. On
+#: the simulated rig's logs no travel is off by more than 0.35 of the limit.
+_SPEED_SCALE = 0.005
+#: Gain error of a resolver's speed, share, as `models.lateness` allows for, which also covers what the trapezoid misses.
+_SPEED_GAIN = 0.02
+#: Samples in a row in which angle and speed repeat to the bit, from which both are stale: by chance, at one repetition in five
+#: of a motor that stands, one in a hundred.
+_REPEATED = 3
+
+
+@njit
+def believe_speed(s: Record, p: Record, m: Record) -> None:
+    """Replace a speed that no torque causes within a cycle, driving or braking with what holds the largest force. The last
+    speed goes on, unless the angle says the same as this one; if the last one was wrong, too, the angle tells the speed."""
+    possible = 2.0 * p.gear_gain * p.maximum_force / p.inertia * m.dt
+    was_wrong, s.speed_wrong = s.speed_wrong, False
+    if not 0.0 < m.dt <= ONE_CYCLE_S or abs(m.speed - s.speed) <= possible:
+        return
+    by_angle = (m.angle - s.angle) / m.dt
+    if abs(m.speed - by_angle) > possible:
+        s.speed_wrong = True
+        m.speed = by_angle if was_wrong and abs(by_angle - s.speed) <= possible else s.speed
+
+
+@njit
+def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
+    """Whether the resolver's zero has moved, because its angle changed without a motion by the speed, which has ``turned`` rad
+    since the last sample; the contact angle is moved with it.
+
+    The shift follows from the speed. If the resolver had been frozen the motor may have turned meanwhile, and an impossible
+    motion may have any cause; then the contact angle becomes uncertain by as much. A resolver that loses counts loses a few in
+    each sample, which shows when the motor stands again; it will lose more, and is not used. An angle that repeats while the
+    speed goes on has lost nothing unless it goes on from there.
+    """
+    jump = m.angle - s.angle
+    frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
+    stuck = s.plausibility.still > 1 or frozen_s > 0.0
+    reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
+    moved, sigma = 0.0, 0.0
+    seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
+    slip = jump - turned
+    # A speed that was late is as far off as one that went through the filter that is undone in its place.
+    unsure = (_SLIP_DELAY_S + s.lateness.filtered) * abs(m.speed - s.speed) + SLIP_RAD
+    behind = s.behind
+    _stay_behind(s, m, jump, turned)
+    # A loose contact repeats an angle, which is right again when it has made up for the way; one that is late by a cycle
+    # repeats whenever a motion begins. What it lacks then counts as what it makes up for: it has strayed by neither.
+    repeats = s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind))
+    if abs(behind) > unsure and s.plausibility.still == 0 and not repeats:
+        moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
+    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN and not repeats:
+        # The speed of a sample that is wrong may be wrong as well.
+        moved, sigma = (slip, hypot(_ZERO_RAD, 0.5 * m.dt * (m.speed - s.speed))) if seen else (jump, reach)
+    elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure and not repeats:
+        moved, sigma = slip, _ZERO_RAD
+    elif seen:
+        moved = _drift(s, m, slip, turned)
+        if moved != 0.0:
+            sigma = abs(moved)
+            s.drifting_s = _DRIFTING_S
+    s.drifting_s = max(s.drifting_s - m.dt, 0.0)
+    if moved != 0.0 or not seen:
+        # A motion that was not observed completely cannot be checked at its end.
+        s.strayed = np.nan
+    s.away_s += m.dt
+    if moved != 0.0:
+        _move_zero(s, p, moved, sigma)
+    return moved != 0.0
+
+
+@njit
+def nobody_brakes(m: Record) -> bool:
+    """Whether the brake controller says so, and the park brake is off."""
+    return m.has_status and m.park_brake == 0.0 and m.brake_request == 0.0
+
+
+@njit
+def at_rest(s: Record, m: Record) -> bool:
+    """Whether nothing asks the motor to turn, so that one whose angle stays does stand: pads apart, and nobody brakes. While
+    it clamps, the motor may turn slowly beside an angle that is frozen."""
+    return nobody_brakes(m) and s.past_contact < 0.0
+
+
+@njit
+def _stay_behind(s, m, jump, turned):
+    """Keep the way (rad) by which an angle that repeats is behind; ``jump`` and ``turned`` rad are what this sample adds to
+    the angle and by the speed."""
+    if jump != 0.0 or s.plausibility.still >= _REPEATED or m.dt > ONE_CYCLE_S:
+        s.behind = 0.0
+    elif abs(turned) > STANDING_RAD_PER_S * m.dt:
+        s.behind += turned
+
+
+@njit
+def _drift(s, m, slip, turned):
+    """How far (rad) the zero has drifted by what shows at standstill or at the end of a way, else 0; ``slip`` and ``turned``
+    rad are what this sample adds to the angle beside the speed, and by it."""
+    s.strayed += slip
+    s.turned += turned
+    s.turned_s += m.dt
+    if max(abs(m.speed), abs(s.speed)) > STANDING_RAD_PER_S:
+        s.drifted = s.stood_s = 0.0
+    else:
+        s.drifted += slip
+        s.stood_s += m.dt
+    if abs(s.drifted) > _unaccounted(s, s.stood_s):
+        stays = s.plausibility.held * CYCLE_S >= s.stood_s - ONE_CYCLE_S
+        if not (stays and (s.unknown or at_rest(s, m))):
+            return s.drifted
+        # An angle that stays where it is does not drift: the speed has an offset. Of an unknown contact nothing is lost.
+        s.drifted = s.stood_s = 0.0
+        s.strayed = np.nan
+    moved = 0.0
+    if s.stood_s > _AT_REST_S:
+        # Only at the end of a motion: at the beginning of the next one a late speed lags the angle.
+        ended = s.stood_s - m.dt <= _AT_REST_S
+        if ended and abs(s.strayed) > _unaccounted(s, s.turned_s) + _SPEED_SCALE * abs(s.turned):
+            moved = s.strayed
+        if ended or s.turned_s > _STOOD_S:
+            s.strayed = s.turned = s.turned_s = 0.0
+    return moved
+
+
+@njit
+def _move_zero(s, p, moved, sigma):
+    """Refer all stored angles to a zero that has moved by ``moved`` rad, known with standard deviation ``sigma`` rad."""
+    s.drifted = s.stood_s = 0.0
+    sigma *= s.gear_slope
+    before = s.covariance[CONTACT, CONTACT]
+    if s.away_s > _AWAY_S:
+        s.away = s.away_variance = s.away_s = 0.0
+        s.known_before = before
+    went = s.away
+    s.away += moved
+    s.away_variance += sigma * sigma
+    if abs(s.away) < _SURELY * sqrt(s.away_variance) < abs(went):
+        # Messages were wrong: zero and contact angle are where they were, and known as well.
+        shift_zero(s, -went)
+        s.away_s = 1e9
+        known = sqrt(s.known_before / before) if before > s.known_before else 1.0
+        for i in range(STATES):
+            s.covariance[CONTACT, i] *= known
+            s.covariance[i, CONTACT] *= known
+        return
+    shift_zero(s, moved)
+    s.covariance[CONTACT, CONTACT] += sigma * sigma
+    open_again(s, p)
+    s.contact.confirmed = False
+
+
+@njit
+def _unaccounted(s, seconds):
+    """Least travel (rad) beyond the integrated speed over ``seconds`` that neither its noise nor its offset explain."""
+    return _ZERO_RAD + OFFSET_RAD_PER_S * seconds + _CERTAIN * s.speed_sigma * sqrt(CYCLE_S * seconds)
