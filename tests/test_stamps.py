@@ -19,6 +19,7 @@ from emb_daemon.logs.contradictions import (
     starts_anew,
 )
 from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.resample import Series
 from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
 from emb_daemon.offline import load_log
@@ -257,6 +258,13 @@ def test_a_plate_that_cools_tells_the_unit_of_time(tmp_path, capsys, step_s, sai
     Mapping(tmp_path / "m.yaml").read(tmp_path / "a.csv")
     told = capsys.readouterr().err
     assert said in told and ("a brake has cooled" in told or "as no backing plate" in told) == bool(said)
+
+
+def test_noise_of_a_thermocouple_in_a_short_log_tells_no_unit_of_time(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    noise_K = np.random.default_rng(1).normal(0.0, 2.0, len(columns["time_s"]))
+    _read(tmp_path, {name: values[:250] for name, values in (columns | {"plate_C": 22.0 + noise_K}).items()})
+    assert "K/s" not in capsys.readouterr().err
 
 
 def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
@@ -864,12 +872,31 @@ def test_a_spreadsheets_days_are_a_unit_of_time(truth, tmp_path):
     assert np.ptp(log.time_s) == pytest.approx(np.ptp(columns["time_s"]), abs=0.01)
 
 
-@pytest.mark.parametrize("begins", [b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\x00"])
-def test_a_bag_of_messages_is_refused_with_what_would_do(tmp_path, begins):
+_OF_MESSAGES, _PACKED = "is not read; expected what it holds as CSV", "is not read; unpack it first"
+
+
+@pytest.mark.parametrize(
+    ("begins", "said"),
+    [
+        *((begins, _OF_MESSAGES) for begins in (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"%PDF-1.4")),
+        *((begins, _OF_MESSAGES) for begins in (b"\x80\x04\x95", b"\x80\x05\x95")),
+        *((begins, _PACKED) for begins in (b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")),
+        (bytes(257) + b"ustar", "is a tar archive, which is not read; unpack it first"),
+        (b"PK\x03\x04", "unpack an archive first"),
+        (b"<!DOCTYPE html>\n", "is a web page"),
+        (b"<html><body>", "is a web page"),
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n",
+            "is a pointer of Git LFS to a file that is not here",
+        ),
+    ],
+)
+def test_what_is_no_log_is_refused_with_what_would_do(tmp_path, begins, said):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    (tmp_path / "a.csv").write_bytes(begins + bytes(200))
-    with pytest.raises(InputError, match="which is not read; expected what it holds as CSV"):
-        Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
+    for name, read in (("a.csv", Mapping(tmp_path / "mapping.yaml").read), ("a.log", read_frames), ("a.blf", read_frames)):
+        (tmp_path / name).write_bytes(begins + bytes(200))
+        with pytest.raises(InputError, match=f"^{tmp_path / name}: .*{re.escape(said)}[^\n]*$"):
+            read(tmp_path / name)
 
 
 _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)

@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_daemon.errors import InputError, tell
 from emb_daemon.logs import arrays
-from emb_daemon.logs.read import ending_of_content, log_ending, needs_extra, read_file, unpack
+from emb_daemon.logs.read import ZIP, ending_of_content, log_ending, needs_extra, read_file, unpack
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.wire.units import UNITS, known_as, stated_in
 
@@ -27,15 +27,7 @@ _TABLES = (".csv", ".txt", ".tsv", ".dat", ".xlsx", ".xls", ".ods", ".parquet", 
 #: Endings of logs of frames alone; all others may be a table's.
 _FRAMES = (".blf", ".asc", ".trc")
 #: How columnar files and workbooks begin.
-_PARQUET, _FEATHER, _WORKBOOKS = b"PAR1", b"ARROW1", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
-#: How containers of messages begin that nothing here reads.
-_BAGS = {
-    b"#ROSBAG": "a ROS bag", b"\x89MCAP": "a ROS 2 bag", b"SQLite format 3": "a database, as ROS 2 bags are",
-    b"\x80\x04\x95": "a pickle of Python", b"\x80\x05\x95": "a pickle of Python",
-    b"version https://git-lfs": "a pointer of Git LFS to a file that is not here",
-}  # fmt: skip
-#: Where a tar archive says that it is one, and what it says.
-_TAR_AT, _TAR = 257, b"ustar"
+_PARQUET, _FEATHER, _WORKBOOKS = b"PAR1", b"ARROW1", (ZIP, b"\xd0\xcf\x11\xe0")
 #: What parts cells; last, any run of blanks.
 _DELIMITERS = (",", ";", "\t", "|", " ")
 #: Largest number of lines of text before a table's header, and of units between header and numbers.
@@ -97,9 +89,6 @@ def read_table(
     raw = read_file(path)
     ending = log_ending(path)
     content, digest = unpack(path, raw), hashlib.sha256(raw).hexdigest()
-    bag = next((what for beginning, what in _BAGS.items() if content.startswith(beginning)), "")
-    if bag := bag or ("a tar archive" if content.startswith(_TAR, _TAR_AT) else ""):
-        raise InputError(f"{path}: is {bag}, which is not read; expected what it holds as CSV, Parquet or .mat")
     begins = ending_of_content(content)
     # `.dat` is the ending of INCA's measurements, and of other tools' text tables.
     if begins == ".mf4" or (ending in _MEASUREMENTS and ending != ".dat"):
