@@ -470,6 +470,17 @@ def test_a_flag_between_no_and_yes_is_said(truth, tmp_path, capsys):
     assert "BrakeRequest is 0 or 1, and between them in" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("one", "is_said"), [(1.0 + 1e-9, False), (100.0, True)])
+def test_a_flag_of_a_coarse_factor_is_one(truth, tmp_path, capsys, one, is_said):
+    """A DBC whose factor makes 1.000000001 of what it means by 1; per cent are no flag."""
+    columns = foreignkit.sampled(truth, 250.0)
+    flag = {"request": np.where(np.arange(len(columns["time_s"])) % 100 < 50, 0.0, one)}
+    mapping = re.sub(r"(VEH_Status.BrakeRequest): .*", r'\1: {signal: request, unit: "1"}', foreignkit.COLUMNS)
+    log = _read(tmp_path, columns | flag, mapping)
+    assert ("a `scale` 100 times smaller" in capsys.readouterr().err) == is_said
+    assert (np.mean(log.slow.status["BrakeRequest"]) == pytest.approx(0.5, abs=0.1)) != is_said
+
+
 def test_a_clock_of_whole_seconds_is_spread_over_its_rows(capsys):
     seconds = np.arange(2500) / 250.0
     times, rows = in_time("x", (1e9 * np.floor(seconds)).astype(np.int64), [np.sin(seconds)])

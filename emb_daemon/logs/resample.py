@@ -496,13 +496,15 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
             column = np.broadcast_to(np.asarray(source, float), times.shape)
             if name == "MotorAngle":
                 column = _within(message.name, column, layout["low"], layout["high"])
-            below = layout["low"] - column
-            column = np.where((below > 0.0) & (below < _ZERO_ERROR * (layout["high"] - layout["low"])), layout["low"], column)
+            rounding = _FLAG if length == 1 else 0.5 * layout["factor"]
+            below = max(rounding, _ZERO_ERROR * (layout["high"] - layout["low"]))
+            at_end = (column > layout["low"] - below) & (column < layout["high"] + rounding)
+            column = np.where(at_end, np.clip(column, layout["low"], layout["high"]), column)
             known = (column >= layout["low"]) & (column <= layout["high"])
             if (beyond := np.mean(np.isfinite(column) & ~known)) > _MOST_BEYOND:
                 so = "count as not measured" if is_reference else "make no frames"
                 much = np.max(np.abs(column[np.isfinite(column)])) / layout["high"]
-                smaller = f" If so, a `scale` {much:.2g} times smaller would fit, with all that it is compared with"
+                smaller = f" If so, a `scale` {much:.3g} times smaller would fit, with all that it is compared with"
                 tell(
                     f"{message.name}: {name} is beyond {layout['low']:g} to {layout['high']:g} in {100.0 * beyond:.3g} % of "
                     f"the samples, which {so}; is its unit right?{smaller if much > 1.0 else ''}"
