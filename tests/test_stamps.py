@@ -21,7 +21,7 @@ from emb_daemon.logs.contradictions import (
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.resample import Series
-from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
+from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays, without_sign
 from emb_daemon.offline import load_log
 
 
@@ -361,11 +361,47 @@ def test_a_vehicle_rolls_on_tyres(factor, is_said):
     assert bool(lines) == is_said
 
 
-def test_a_current_whose_sign_is_read_as_its_highest_bit_is_said(truth, tmp_path, capsys):
+@pytest.mark.parametrize(("step_A", "bits"), [(0.002, 16), (0.05, 12)])
+def test_a_current_that_lost_its_sign_is_said_and_has_it_by_its_period(truth, tmp_path, capsys, step_A, bits):
     columns = foreignkit.sampled(truth, 250.0)
-    _read(tmp_path, columns | {"current_A": np.mod(columns["current_A"], 60.0)})
-    assert "CurrentQ jumps by about" in (told := capsys.readouterr().err)
-    assert "is it a number with a sign that is read without one" in told
+    counts = np.mod(np.rint(columns["current_A"] / step_A), 2.0**bits)
+    written = columns | {"current_A": step_A * counts}
+    _read(tmp_path, written)
+    whole = f"{step_A * 2.0**bits:.10g}"
+    assert f"current_A jumps between 0 and {whole}, the end of its bits" in (told := capsys.readouterr().err)
+    assert f"Then `period: {whole}`" in told and told.count("jumps between") == 1
+    mapping = foreignkit.COLUMNS.replace("current_A, unit: A", f"current_A, unit: A, period: {whole}")
+    log = _read(tmp_path, written, mapping)
+    assert "jumps between" not in capsys.readouterr().err
+    plain = _read(tmp_path, columns)
+    assert log.samples["current_q"] == pytest.approx(plain.samples["current_q"], abs=0.6 * step_A + 0.006)
+
+
+def test_a_position_of_32_bits_may_begin_below_zero(truth, tmp_path, capsys):
+    """As a drive's counts are written that knows no sign, and printed with eight digits."""
+    columns = foreignkit.sampled(truth, 250.0)
+    counts = np.mod(np.rint(columns["angle_rad"] * 1e4) - 3.0, 2.0**32)
+    counts = np.array([float(f"{count:.8g}") for count in counts])
+    _read(tmp_path, columns | {"angle_rad": counts})
+    assert "angle_rad jumps between 0 and 4294967296" in capsys.readouterr().err
+    mapping = foreignkit.COLUMNS.replace("angle_rad, unit: rad", f"angle_rad, unit: rad, scale: 1e-4, period: {2**32}")
+    log = _read(tmp_path, columns | {"angle_rad": counts}, mapping)
+    assert log.samples["angle"] == pytest.approx(_read(tmp_path, columns).samples["angle"], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.where(np.arange(1000) % 100 < 50, 0.0, 250.0),
+        np.interp(np.arange(1000), [0, 495, 500, 999], [0.0, 90.0, 3900.0, 4000.0]).round(),
+        np.mod(41.0 * np.arange(1000), 4096.0),
+        np.where(np.arange(1000) % 100 < 50, -3.0, 4000.0) + np.arange(1000) % 7,
+        np.abs(np.rint(4000.0 * np.sin(np.arange(1000) / 50.0))),
+    ],
+    ids=["two levels", "a step", "a turn", "levels of either sign", "a size"],
+)
+def test_what_goes_between_two_values_has_not_lost_a_sign(values):
+    assert without_sign(values) == 0.0
 
 
 def test_one_stroke_like_the_other_is_no_turn():

@@ -139,7 +139,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if bare:
         return lines
     if current is not None and np.ptp(current.values):
-        lines += _find_unsigned(current) or _find_turned_current(angle, current)
+        lines += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
         lines += _find_turned_force(angle, force) or [*_find_untared(angle, force), *_find_late_force(angle, force)]
     return lines
@@ -323,17 +323,6 @@ def _find_other_time(name: str, temperature: Series) -> list[str]:
     return [
         f"{name} changes by {fastest:.3g} K/s, as no backing plate does: is the unit of time right, or does its thermocouple "
         "open?"
-    ]
-
-
-def _find_unsigned(current: Series) -> list[str]:
-    """A line on a current that jumps between the ends of its range, as a number with a sign does that is read without one."""
-    jump = starts_anew(current)
-    if not jump or np.min(current.values) < -_FOLLOWS * jump:
-        return []
-    return [
-        f"CurrentQ jumps by about {jump:.4g} A to and fro: is it a number with a sign that is read without one (the DBC says "
-        "unsigned)?"
     ]
 
 

@@ -34,7 +34,7 @@ from emb_daemon.logs.resample import (
     standing,
     way_of,
 )
-from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
+from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays, without_sign
 from emb_daemon.logs.tables import read_table
 from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, signal_columns
@@ -76,8 +76,8 @@ class Mapped(Struct, kw_only=True):
     scale: float = 1.0
     #: In our unit.
     offset: float = 0.0
-    #: What the value jumps by where it starts anew, in the rig's unit: 360 of an angle in degrees within one turn. Between two
-    #: samples it must move by less than half of it.
+    #: What the value jumps by where it starts anew, in the rig's unit: 360 of an angle in degrees within one turn, 65536 of a
+    #: number of 16 bits that was written without its sign. Between two samples an angle must move by less than half of it.
     period: Positive | None = None
     #: Time over which the value is a mean that ends with its stamp, ms, and twice the delay of a filter; 0 is a value of the
     #: moment. Left out it is 0, and a sampling period for CurrentQ: a mean since the last frame, as on our bus.
@@ -192,8 +192,12 @@ class Source:
         series = Series.of(time_ns, values)
         if (sampled := held_rows(series.values)) is not None:
             series = Series(series.time_ns[sampled], series.values[sampled])
-        turned = series.values if self.period is None else np.unwrap(series.values, period=self.period)
-        return Series(series.time_ns, self.scale * turned + self.offset).averaged(self.span_ns)
+        values = series.values
+        if self.period is not None and len(values):
+            # What is no angle does not go on beyond its range, but has a sign.
+            whole = np.rint((values[:1] if self.target == "rad" else values) / self.period) * self.period
+            values = (np.unwrap(values, period=self.period) if self.target == "rad" else values) - whole
+        return Series(series.time_ns, self.scale * values + self.offset).averaged(self.span_ns)
 
 
 class Mapping:
@@ -403,6 +407,7 @@ class Mapping:
                 these = ", ".join(f"{value:g}" for value in np.unique(values[none]))
                 tell(f"{path}: {name}: {np.sum(none)} values are {these}, which stand for none: left out")
                 raw[_, name] = stamps[~none], values[~none]
+        self._question_signs(path, raw)
         messages = {
             name: {
                 key: source.converted(*raw[source.bus, source.name]) if isinstance(source, Source) else source
@@ -436,6 +441,15 @@ class Mapping:
         # Recorders may have times before zero, before their trigger; our logs may not.
         frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
+
+    def _question_signs(self, path: Path, raw: dict[tuple, tuple]) -> None:
+        """Say which signals have lost their sign, unless the mapping knows."""
+        for bus, name in {(s.bus, s.name): None for m in self.messages for s in self._sources(m).values() if s.period is None}:
+            if whole := without_sign(raw[bus, name][1]):
+                tell(
+                    f"{path}: {name} jumps between 0 and {whole:.10g}, the end of its bits: a number with a sign that is read "
+                    f"without one, or an angle that starts anew? Then `period: {whole:.10g}`"
+                )
 
     def _question(self, path: Path, units: dict[str, str]) -> None:
         """Say which units a file states that the mapping contradicts, of columns whose names state none."""
