@@ -42,13 +42,14 @@ class _Value:
     last: float = math.nan
     total: float = 0.0
     count: int = 0
-    _turned: float = math.nan
+    _turned: float = 0.0
 
     def take(self, raw: float, time_ns: int) -> None:
         period = self.source.period
-        if period is not None and math.isfinite(self._turned):
+        if period is not None:
             raw = self._turned + math.remainder(raw - self._turned, period)
-        self._turned = raw
+        if self.source.goes_on:
+            self._turned = raw
         self.last, self.heard_ns = self.source.scale * raw + self.source.offset, time_ns
         self.total += self.last
         self.count += 1

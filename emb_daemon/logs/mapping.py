@@ -188,15 +188,19 @@ class Source:
         as_scaled = math.isclose(abs(self.scale), factor, rel_tol=1e-3) and (self._shifted or self.offset == zero)
         return "" if as_stated or as_scaled else f"{self.name} says {own} and is taken in {self.unit}: which is right?"
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether it goes on beyond its ``period``, as an angle does; a number without its sign does not."""
+        return self.target == "rad"
+
     def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
         series = Series.of(time_ns, values)
         if (sampled := held_rows(series.values)) is not None:
             series = Series(series.time_ns[sampled], series.values[sampled])
         values = series.values
         if self.period is not None and len(values):
-            # What is no angle does not go on beyond its range, but has a sign.
-            whole = np.rint((values[:1] if self.target == "rad" else values) / self.period) * self.period
-            values = (np.unwrap(values, period=self.period) if self.target == "rad" else values) - whole
+            whole = np.rint((values[:1] if self.goes_on else values) / self.period) * self.period
+            values = (np.unwrap(values, period=self.period) if self.goes_on else values) - whole
         return Series(series.time_ns, self.scale * values + self.offset).averaged(self.span_ns)
 
 
