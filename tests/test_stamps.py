@@ -20,7 +20,7 @@ from emb_daemon.logs.contradictions import (
 )
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
-from emb_daemon.logs.resample import Series
+from emb_daemon.logs.series import Series
 from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays, without_sign
 from emb_daemon.offline import load_log
 

@@ -9,7 +9,8 @@ import numpy as np
 from emb_daemon.calibration.types import Motor
 from emb_daemon.jit import Records
 from emb_daemon.logs.columns import shipped_database
-from emb_daemon.logs.resample import Series, Signals, is_bare, is_unresolved, turns_free
+from emb_daemon.logs.resample import Signals, is_bare, is_unresolved, turns_free
+from emb_daemon.logs.series import Series
 
 #: Least number of samples; number of parts of the travel over which means are taken, and least number of samples in each.
 _LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
