@@ -11,13 +11,8 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.logs.contradictions import (
-    _find_late_force,
-    contradictions,
-    other_current,
-    other_motor,
-    starts_anew,
-)
+from emb_daemon.logs.contradictions import _find_late_force, contradictions, starts_anew
+from emb_daemon.logs.currents import other_current, other_motor
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.series import Series

@@ -27,7 +27,7 @@ from emb_daemon.effects.base import OF_THE_MOTOR
 from emb_daemon.effects.terms import PORTS, SIGNALS
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
-from emb_daemon.logs.contradictions import current_late_ms
+from emb_daemon.logs.currents import current_late_ms
 from emb_daemon.logs.series import Series
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.run import held, run_paths, run_step
