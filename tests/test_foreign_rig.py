@@ -973,6 +973,15 @@ def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):
     assert expected in line
 
 
+@pytest.mark.parametrize(("load", "missed"), [("{value: 0}", 1), ("{signal: force_N, unit: N}", 4)], ids=["none", "measured"])
+def test_of_a_machine_that_clamps_nothing_no_brakes_messages_are_missed(tmp_path, load, missed):
+    signals = "EMB_FL_Resolver.MotorAngle: {signal: angle_rad, unit: rad}", f"RIG_FL_Force.ClampForceRef: {load}"
+    text = "\n  ".join(["format: 1\ntime: {signal: time_s}\nsignals:", *signals])
+    (tmp_path / "mapping.yaml").write_text(text + "\n")
+    notes = [note for note in Mapping(tmp_path / "mapping.yaml").notes if "is not mapped" in note]
+    assert len(notes) == missed and "EMB_FL_Current" in notes[0]
+
+
 @pytest.mark.parametrize(("unit", "newton"), [("kgf", 9.80665), ("kg", 9.80665), ("lbf", 4.448222), ("daN", 10.0)])
 def test_a_load_cell_may_speak_of_the_mass_that_weighs_so_much(tmp_path, unit, newton):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", f"force_N, unit: {unit}"))

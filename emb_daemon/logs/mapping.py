@@ -27,6 +27,7 @@ from emb_daemon.logs.resample import (
     is_unresolved,
     our_messages,
     standing,
+    turns_free,
     way_of,
 )
 from emb_daemon.logs.series import Series
@@ -202,10 +203,12 @@ class Mapping:
                 else:
                     self.notes.append(f"{self.path}: {name} is constant: the motor stands throughout")
         for corner in corners:
-            for message, text in _LOST.items():
+            # What clamps nothing has neither pads nor a disc, and is never released.
+            asked = [_CURRENT] if turns_free(corner, self.messages) else _LOST
+            for message in asked:
                 if (name := message.format(corner)) not in self.messages:
                     blind = name == "VEH_Status" and f"EMB_{corner}_Current" not in self.messages
-                    self.notes.append(f"{self.path}: {name} is not mapped: {_BLIND if blind else text}")
+                    self.notes.append(f"{self.path}: {name} is not mapped: {_BLIND if blind else _LOST[message]}")
 
     def require_frames(self) -> None:
         """Raises InputError of a mapping of tables, which has no frames."""
@@ -369,8 +372,9 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
 
 _BENCH = "of a bench say so by `value: 0` of ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp"
 #: What a corner loses with a message that is not mapped.
+_CURRENT = "EMB_{}_Current"
 _LOST = {
-    "EMB_{}_Current": "the force rests on the motor angle alone",
+    _CURRENT: "the force rests on the motor angle alone",
     "EMB_{}_Thermocouple": "the pads' temperature is unknown, and sigma holds what it may do",
     "VEH_WheelSpeed": "the disc may be turning and heating, and sigma grows; of one that stands say so by `value: 0`",
     "VEH_Status": "that the brake was released has to be shown by motor and current; " + _BENCH,
