@@ -17,7 +17,7 @@ from emb_daemon.calibration import configuration, types
 from emb_daemon.effects import REGISTRY
 from emb_daemon.estimator import status
 from emb_daemon.identify import campaign_file
-from emb_daemon.logs import mapping
+from emb_daemon.logs import mapping_file
 from emb_daemon.wire import contract
 
 _HERE = Path(__file__).parent
@@ -175,7 +175,7 @@ def pages() -> dict[str, str]:
             "Mapping file",
             "Where our signals come from in the logs of another rig: `--mapping FILE` of the commands that read logs. "
             "[How it is used](formats.md#another-rigs-signals); [an example](own_actuator.md).",
-            mapping.MappingFile,
+            mapping_file.MappingFile,
         ),
         "campaign.md": _structs(
             "Campaign and datasheet",

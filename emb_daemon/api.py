@@ -20,7 +20,8 @@ from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import names
 from emb_daemon.logs.mapping import Mapping as Mapping
-from emb_daemon.logs.resample import Series, filled, frames_of
+from emb_daemon.logs.resample import filled, frames_of
+from emb_daemon.logs.series import Series
 from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.logs.write import reference_columns, table_columns
 from emb_daemon.offline import Log, corner_index, estimate, log_of

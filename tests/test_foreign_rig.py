@@ -309,9 +309,6 @@ def test_a_table_is_one_whatever_it_is_called(tmp_path, capsys):
         (b"PK\x03\x04", "not readable"),
         (b"\x89HDF", "not readable"),
         (b"a\rb\n", "not readable"),
-        (b"\x80\x04\x95", "is a pickle of Python, which is not read"),
-        (bytes(257) + b"ustar", "is a tar archive, which is not read"),
-        (b"PK\x03\x04", "unpack an archive first"),
     ):
         (tmp_path / "c.csv").write_bytes(binary + bytes(100))
         with pytest.raises(InputError, match=said):
@@ -974,6 +971,15 @@ def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):
         Mapping(tmp_path / "mapping.yaml")
     [line] = str(error.value).splitlines()
     assert expected in line
+
+
+@pytest.mark.parametrize(("load", "missed"), [("{value: 0}", 1), ("{signal: force_N, unit: N}", 4)], ids=["none", "measured"])
+def test_of_a_machine_that_clamps_nothing_no_brakes_messages_are_missed(tmp_path, load, missed):
+    signals = "EMB_FL_Resolver.MotorAngle: {signal: angle_rad, unit: rad}", f"RIG_FL_Force.ClampForceRef: {load}"
+    text = "\n  ".join(["format: 1\ntime: {signal: time_s}\nsignals:", *signals])
+    (tmp_path / "mapping.yaml").write_text(text + "\n")
+    notes = [note for note in Mapping(tmp_path / "mapping.yaml").notes if "is not mapped" in note]
+    assert len(notes) == missed and "EMB_FL_Current" in notes[0]
 
 
 @pytest.mark.parametrize(("unit", "newton"), [("kgf", 9.80665), ("kg", 9.80665), ("lbf", 4.448222), ("daN", 10.0)])

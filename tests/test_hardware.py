@@ -309,6 +309,16 @@ def test_a_current_that_does_not_turn_a_free_motor_tells_nothing_of_its_friction
     assert with_rest.after.rmse("torque") > 5.0 * found.after.rmse("torque")
 
 
+def test_a_torque_that_is_explained_to_the_bit_is_judged():
+    """A motor that a wheel drives on at a steady speed draws nothing; without friction nothing is left, and that is known."""
+    time_s = 0.004 * np.arange(4000)
+    speed = np.where(time_s < 8.0, 3.0 * np.sin(np.pi * np.minimum(time_s, 8.5)), 3.0)
+    log = _drawn(time_s, np.cumsum(speed) * 0.004, speed, np.where(time_s < 8.5, 0.3, 0.0))
+    bench = Bench([log], _of_a_joint(offset_Nm=0.2))
+    judged = [errors(bench, _of_a_joint(offset_Nm=friction)).samples("torque") for friction in (0.2, 0.0)]
+    assert judged[0] == judged[1] > 3000
+
+
 def test_a_free_motor_that_never_turns_is_no_diagnosis():
     time_s = 0.004 * np.arange(2000)
     logs = [_drawn(time_s, 0.0 * time_s, 0.0 * time_s, 0.01 * n * np.sin(time_s)) for n in range(1, 8)]

@@ -64,6 +64,31 @@ def test_frames_of_another_rig_become_samples_at_our_rate(tmp_path, rate_Hz):
     assert samples["has_status"][100] and not np.isfinite(log.force_N).any(), "the estimator never sees a reference"
 
 
+def test_a_period_is_the_same_live_as_in_a_log(tmp_path):
+    """A current of 16 bits without its sign, of 20 A to and fro, and an angle within one turn that begins at 359 degrees."""
+    message = (
+        'VERSION ""\nBU_: T\nBO_ 33 M: 4 T\n SG_ A : 0|16@1+ (0.01,0) [0|0] "deg" T\n SG_ I : 16|16@1+ (1,0) [0|0] "mA" T\n'
+    )
+    (tmp_path / "m.dbc").write_text(message)
+    (tmp_path / "mapping.yaml").write_text(
+        "format: 1\ndbc: m.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: M.A, period: 360}\n"
+        "  EMB_FL_Current.CurrentQ: {signal: M.I, period: 65536, mean_ms: 0}\n"
+    )
+    mapping, live, lines = Mapping(tmp_path / "mapping.yaml"), [], []
+    bus = MappedBus(_Silent(), mapping)
+    for tick in range(250):
+        degree, current_mA = (359.0 + 3.0 * tick) % 360.0, (20000 if tick // 50 % 2 else -20000) % 65536
+        data = round(100.0 * degree).to_bytes(2, "little") + current_mA.to_bytes(2, "little")
+        live += bus.heard(can.Message(arbitration_id=33, is_extended_id=False, data=data), 1_000_000_000 + 4_000_000 * tick)
+        lines.append(f"({1.0 + 0.004 * tick:.6f}) can0 021#{data.hex().upper()}\n")
+    (tmp_path / "a.log").write_text("".join(lines))
+    heard, read = log_of(np.array(live, FRAME)).samples, log_of(mapping.read(tmp_path / "a.log")).samples
+    for samples in (heard, read):
+        assert samples["angle"][0] == pytest.approx(np.radians(-1.0), abs=1e-3)
+        assert np.ptp(samples["angle"]) == pytest.approx(np.radians(747.0), abs=0.15)
+        assert np.quantile(samples["current_q"], (0.1, 0.9)) == pytest.approx([-20.0, 20.0], abs=0.1)
+
+
 def test_a_j1939_group_is_heard_of_its_first_sender(tmp_path):
     """800 rpm of one engine's controller, which another's 900 do not change; 0xFFFF is no speed."""
     message = 'VERSION ""\nBU_: T\nBO_ 2364540158 EEC1: 8 T\n SG_ EngineSpeed : 24|16@1+ (0.125,0) [0|8031.875] "rpm" T\n'

@@ -11,16 +11,12 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
-from emb_daemon.logs.contradictions import (
-    _find_late_force,
-    contradictions,
-    other_current,
-    other_motor,
-    starts_anew,
-)
+from emb_daemon.logs.contradictions import _find_late_force, contradictions, starts_anew
+from emb_daemon.logs.currents import other_current, other_motor
 from emb_daemon.logs.mapping import Mapping
-from emb_daemon.logs.resample import Series
-from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
+from emb_daemon.logs.read import read_frames
+from emb_daemon.logs.series import Series
+from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays, without_sign
 from emb_daemon.offline import load_log
 
 
@@ -259,6 +255,13 @@ def test_a_plate_that_cools_tells_the_unit_of_time(tmp_path, capsys, step_s, sai
     assert said in told and ("a brake has cooled" in told or "as no backing plate" in told) == bool(said)
 
 
+def test_noise_of_a_thermocouple_in_a_short_log_tells_no_unit_of_time(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    noise_K = np.random.default_rng(1).normal(0.0, 2.0, len(columns["time_s"]))
+    _read(tmp_path, {name: values[:250] for name, values in (columns | {"plate_C": 22.0 + noise_K}).items()})
+    assert "K/s" not in capsys.readouterr().err
+
+
 def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
     """As a measured one it would tell the torque path that nothing clamps: 9 kN of error."""
     columns = foreignkit.sampled(truth, 250.0)
@@ -353,11 +356,47 @@ def test_a_vehicle_rolls_on_tyres(factor, is_said):
     assert bool(lines) == is_said
 
 
-def test_a_current_whose_sign_is_read_as_its_highest_bit_is_said(truth, tmp_path, capsys):
+@pytest.mark.parametrize(("step_A", "bits"), [(0.002, 16), (0.05, 12)])
+def test_a_current_that_lost_its_sign_is_said_and_has_it_by_its_period(truth, tmp_path, capsys, step_A, bits):
     columns = foreignkit.sampled(truth, 250.0)
-    _read(tmp_path, columns | {"current_A": np.mod(columns["current_A"], 60.0)})
-    assert "CurrentQ jumps by about" in (told := capsys.readouterr().err)
-    assert "is it a number with a sign that is read without one" in told
+    counts = np.mod(np.rint(columns["current_A"] / step_A), 2.0**bits)
+    written = columns | {"current_A": step_A * counts}
+    _read(tmp_path, written)
+    whole = f"{step_A * 2.0**bits:.10g}"
+    assert f"current_A jumps between 0 and {whole}, the end of its bits" in (told := capsys.readouterr().err)
+    assert f"Then `period: {whole}`" in told and told.count("jumps between") == 1
+    mapping = foreignkit.COLUMNS.replace("current_A, unit: A", f"current_A, unit: A, period: {whole}")
+    log = _read(tmp_path, written, mapping)
+    assert "jumps between" not in capsys.readouterr().err
+    plain = _read(tmp_path, columns)
+    assert log.samples["current_q"] == pytest.approx(plain.samples["current_q"], abs=0.6 * step_A + 0.006)
+
+
+def test_a_position_of_32_bits_may_begin_below_zero(truth, tmp_path, capsys):
+    """As a drive's counts are written that knows no sign, and printed with eight digits."""
+    columns = foreignkit.sampled(truth, 250.0)
+    counts = np.mod(np.rint(columns["angle_rad"] * 1e4) - 3.0, 2.0**32)
+    counts = np.array([float(f"{count:.8g}") for count in counts])
+    _read(tmp_path, columns | {"angle_rad": counts})
+    assert "angle_rad jumps between 0 and 4294967296" in capsys.readouterr().err
+    mapping = foreignkit.COLUMNS.replace("angle_rad, unit: rad", f"angle_rad, unit: rad, scale: 1e-4, period: {2**32}")
+    log = _read(tmp_path, columns | {"angle_rad": counts}, mapping)
+    assert log.samples["angle"] == pytest.approx(_read(tmp_path, columns).samples["angle"], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.where(np.arange(1000) % 100 < 50, 0.0, 250.0),
+        np.interp(np.arange(1000), [0, 495, 500, 999], [0.0, 90.0, 3900.0, 4000.0]).round(),
+        np.mod(41.0 * np.arange(1000), 4096.0),
+        np.where(np.arange(1000) % 100 < 50, -3.0, 4000.0) + np.arange(1000) % 7,
+        np.abs(np.rint(4000.0 * np.sin(np.arange(1000) / 50.0))),
+    ],
+    ids=["two levels", "a step", "a turn", "levels of either sign", "a size"],
+)
+def test_what_goes_between_two_values_has_not_lost_a_sign(values):
+    assert without_sign(values) == 0.0
 
 
 def test_one_stroke_like_the_other_is_no_turn():
@@ -460,6 +499,17 @@ def test_a_flag_between_no_and_yes_is_said(truth, tmp_path, capsys):
     mapping = re.sub(r"(VEH_Status.BrakeRequest): .*", r'\1: {signal: request, unit: "1"}', foreignkit.COLUMNS)
     _read(tmp_path, columns | flag, mapping)
     assert "BrakeRequest is 0 or 1, and between them in" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("one", "is_said"), [(1.0 + 1e-9, False), (100.0, True)])
+def test_a_flag_of_a_coarse_factor_is_one(truth, tmp_path, capsys, one, is_said):
+    """A DBC whose factor makes 1.000000001 of what it means by 1; per cent are no flag."""
+    columns = foreignkit.sampled(truth, 250.0)
+    flag = {"request": np.where(np.arange(len(columns["time_s"])) % 100 < 50, 0.0, one)}
+    mapping = re.sub(r"(VEH_Status.BrakeRequest): .*", r'\1: {signal: request, unit: "1"}', foreignkit.COLUMNS)
+    log = _read(tmp_path, columns | flag, mapping)
+    assert ("a `scale` 100 times smaller" in capsys.readouterr().err) == is_said
+    assert (np.mean(log.slow.status["BrakeRequest"]) == pytest.approx(0.5, abs=0.1)) != is_said
 
 
 def test_a_clock_of_whole_seconds_is_spread_over_its_rows(capsys):
@@ -864,12 +914,31 @@ def test_a_spreadsheets_days_are_a_unit_of_time(truth, tmp_path):
     assert np.ptp(log.time_s) == pytest.approx(np.ptp(columns["time_s"]), abs=0.01)
 
 
-@pytest.mark.parametrize("begins", [b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\x00"])
-def test_a_bag_of_messages_is_refused_with_what_would_do(tmp_path, begins):
+_OF_MESSAGES, _PACKED = "is not read; expected what it holds as CSV", "is not read; unpack it first"
+
+
+@pytest.mark.parametrize(
+    ("begins", "said"),
+    [
+        *((begins, _OF_MESSAGES) for begins in (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"%PDF-1.4")),
+        *((begins, _OF_MESSAGES) for begins in (b"\x80\x04\x95", b"\x80\x05\x95")),
+        *((begins, _PACKED) for begins in (b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")),
+        (bytes(257) + b"ustar", "is a tar archive, which is not read; unpack it first"),
+        (b"PK\x03\x04", "unpack an archive first"),
+        (b"<!DOCTYPE html>\n", "is a web page"),
+        (b"<html><body>", "is a web page"),
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n",
+            "is a pointer of Git LFS to a file that is not here",
+        ),
+    ],
+)
+def test_what_is_no_log_is_refused_with_what_would_do(tmp_path, begins, said):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    (tmp_path / "a.csv").write_bytes(begins + bytes(200))
-    with pytest.raises(InputError, match="which is not read; expected what it holds as CSV"):
-        Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
+    for name, read in (("a.csv", Mapping(tmp_path / "mapping.yaml").read), ("a.log", read_frames), ("a.blf", read_frames)):
+        (tmp_path / name).write_bytes(begins + bytes(200))
+        with pytest.raises(InputError, match=f"^{tmp_path / name}: .*{re.escape(said)}[^\n]*$"):
+            read(tmp_path / name)
 
 
 _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)

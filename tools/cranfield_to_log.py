@@ -36,7 +36,8 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
-from emb_daemon.logs.resample import Series, fill_missing, frames_of
+from emb_daemon.logs.resample import fill_missing, frames_of
+from emb_daemon.logs.series import Series
 
 LEAD_M = 5e-3
 GEAR_GAIN_M_PER_RAD = LEAD_M / (2.0 * np.pi)

@@ -30,7 +30,8 @@ from emb_daemon.atomic import write_atomically
 from emb_daemon.calibration.files import save_calibration
 from emb_daemon.errors import InputError
 from emb_daemon.logs.candump import format_candump
-from emb_daemon.logs.resample import Series, frames_of
+from emb_daemon.logs.resample import frames_of
+from emb_daemon.logs.series import Series
 from emb_daemon.wire.contract import CYCLE_NS
 
 GEAR_GAIN_M_PER_RAD = 5e-4

@@ -100,7 +100,7 @@ def _calibration(arguments: argparse.Namespace):
 
 def _warn_of_other_motor(results, motor):
     """Print to stderr where current and motion of a log are not those of the calibration's ``motor``."""
-    from emb_daemon.logs.contradictions import other_current, other_motor
+    from emb_daemon.logs.currents import other_current, other_motor
     from emb_daemon.wire.layout import CORNERS
 
     for result in results:

@@ -18,9 +18,7 @@ def errors_of(bench: Bench, trial: Trial, calibration: Calibration) -> EpisodeEr
     log, parameters = trial.log, to_parameters(calibration)
     turning = is_turning(log.samples)
     if not bench.clamps:
-        residual = bench.residual_of(trial, run_step(log.samples, held(parameters)), "torque")
-        # Nothing is where nothing can be said.
-        errors = {"torque": np.where(residual == 0.0, np.nan, residual)}
+        errors = {"torque": bench.torque_left(trial, run_step(log.samples, held(parameters)))}
         return EpisodeErrors.of(errors, {"rotating": turning, "standing": ~turning}, trial.episode)
     estimates = estimate(log.samples, parameters)
     if bench.has_reference:

@@ -27,8 +27,8 @@ from emb_daemon.effects.base import OF_THE_MOTOR
 from emb_daemon.effects.terms import PORTS, SIGNALS
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
-from emb_daemon.logs.contradictions import current_late_ms
-from emb_daemon.logs.resample import Series
+from emb_daemon.logs.currents import current_late_ms
+from emb_daemon.logs.series import Series
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.run import held, run_paths, run_step
 from emb_daemon.wire.contract import CYCLE_S
@@ -472,10 +472,11 @@ class Bench:
             return np.nan_to_num(trial.temperature_C - temperature).ravel()
         if channel == "brake_torque":
             return self._brake_torque_left(trial, trace)
-        return self._torque_left(trial, trace, per_ampere)
+        return np.nan_to_num(self.torque_left(trial, trace, per_ampere))
 
-    def _torque_left(self, trial: Trial, trace: np.ndarray, per_ampere: np.ndarray | None) -> np.ndarray:
-        """Motor torque that the clamp force does not explain, as force; without a reference, the force of the other path."""
+    def torque_left(self, trial: Trial, trace: np.ndarray, per_ampere: np.ndarray | None = None) -> np.ndarray:
+        """Motor torque that the clamp force does not explain, as force; without a reference, the force of the other path. NaN
+        where nothing can be said."""
         judged = trial.force_N if self.has_reference else trace["force"]
         mean = judged.copy()
         mean[1:] = 0.5 * (judged[1:] + judged[:-1])
@@ -498,7 +499,7 @@ class Bench:
         if self.turns_free:
             # Without a load friction holds a motor that stands, whatever its current below that of friction.
             told &= ~trial.stands
-        return np.where(told, np.nan_to_num(load, nan=0.0), 0.0)
+        return np.where(told, load, np.nan)
 
     def _brake_torque_left(self, trial: Trial, trace: np.ndarray) -> np.ndarray:
         samples = trial.log.samples

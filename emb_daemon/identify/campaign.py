@@ -12,7 +12,7 @@ from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.identify.campaign_file import CampaignFile, Datasheet, DiscCooling, Recording, Training
 from emb_daemon.jit import njit
-from emb_daemon.logs.contradictions import other_motor
+from emb_daemon.logs.currents import other_motor
 from emb_daemon.logs.read import read_with_digest
 from emb_daemon.offline import Log, corner_index, load_log
 from emb_daemon.resources import resource

@@ -6,13 +6,21 @@ reported.
 
 import numpy as np
 
-from emb_daemon.calibration.types import Motor
-from emb_daemon.jit import Records
 from emb_daemon.logs.columns import shipped_database
-from emb_daemon.logs.resample import Series, Signals, is_bare, is_unresolved, turns_free
+from emb_daemon.logs.currents import (
+    AGAINST,
+    JUDGED,
+    LEAST,
+    find_driving_friction,
+    find_late_current,
+    find_other_current,
+    least_lag,
+)
+from emb_daemon.logs.resample import Signals, is_bare, is_unresolved, turns_free
+from emb_daemon.logs.series import Series
 
-#: Least number of samples; number of parts of the travel over which means are taken, and least number of samples in each.
-_LEAST, _PARTS, _LEAST_IN_PART = 200, 10, 10
+#: Number of parts of the travel over which means are taken, and least number of samples in each.
+_PARTS, _LEAST_IN_PART = 10, 10
 #: Least mean of the current at one end of the travel, as a share of the largest, and as a multiple of that at the other end.
 _HOLDS, _MORE = 0.2, 2.0
 #: Least time without a value that is a gap, s: half a clamp; and in periods of the signal, since recorders of few values
@@ -28,16 +36,6 @@ _FOLLOWS = 0.2
 #: and how alike an open brake's force is meanwhile, as a share of its range: a clamp that begins in contact has a slope there.
 #: Least share of the range that is no zero error of a tared load cell's.
 _STOOD, _BEGUN, _LEAST_IN_CLEARANCE, _FLAT, _TARED = 0.05, 0.15, 3, 0.02, 0.03
-#: Correlation of force and current without acceleration below minus which the sign of one is wrong. Friction that holds the
-#: force while the current falls leaves 0.7 to 0.9 of it in hard motion and in slow clamps.
-_AGAINST = 0.5
-#: How many times more of a current the load must leave than its power or its size, or it is the motor's: of 120 drawn
-#: machines, and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3
-#: and more. How often the signs of what a current needs are told again from the last fit, and how far, as a share of its
-#: range, a current without a sign goes to the other side: on a dynamometer that drives one way the motor's own goes by 0.04.
-_OTHERWISE, _SIGNS, _OF_ONE_SIGN = 1.25, 10, 0.02
-#: Share of the highest speed from which the motor moves.
-_MOVING = 0.05
 #: Largest force of a log, N, below which it is not a clamp force in N: production brakes reach 10 to 40 kN.
 _LEAST_CLAMP_N = 100.0
 #: Fastest change of an angle that our message of the motor's speed carries, rad/s: 6 000 rpm; share of the time in which it
@@ -61,23 +59,8 @@ _RELAXES_S, _LATE_S, _EARLY_S, _LONGEST_LAG_S, _LAG_STEP_S = 0.03, 0.08, 0.02, 0
 #: after, s, between which an angle's way is told, for the same reason.
 _PASSES, _PLACES, _WAY_S = 1.5, 400, 0.1
 #: How many times less of a force a curve over the angle must then leave, late (slow clamps' hysteresis gains up to 1.8) and
-#: early (it gains nothing); what is as good as the best; number of samples that are judged, and of parts of the curve.
-_LATE_BETTER, _EARLY_BETTER, _AS_GOOD, _JUDGED, _CURVE_PARTS = 2.0, 1.2, 1.3, 50_000, 60
-#: Least delay of a current that is said, half a cycle of ours, and longest that is looked for beside an acceleration, which a
-#: longer part of a motion that repeats itself resembles, and beside a load, whose sensor may have a slow filter, ms; how many
-#: times less of the current they must then leave: machines whose current is of its time gain up to 1.46, one at 67 Hz whose
-#: current is not 5.7; number of samples that are compared.
-_LEAST_CURRENT_MS, _BESIDE_MOTION_MS, _BESIDE_LOAD_MS, _CURRENT_BETTER, _COMPARED = 2, 30, 150, 1.5, 10_000
-#: Partial correlation of current and acceleration from which the inertia is told (0.75 and more in motion, 0.3 in slow clamps,
-#: 0.5 at a false 11 times where 10 Hz miss the motion), and how many times another than the stated one it then is: a unit
-#: beyond its tolerances is within 1.5, a gear or another unit of an angle is not.
-_TOLD_INERTIA, _OTHER_INERTIA = 0.8, 3.0
-#: By how much what load and acceleration need of a current may differ to be the same share, and how far from one that is
-#: another scale: eleven logs of changed brakes are within 4 % and, where magnets have faded, 1.16; an effective value is 0.71.
-_SAME_SHARE, _OTHER_CURRENT = 0.1, 1.25
-#: Correlation, and share of the inertia, below which the current does not accelerate the motor, and least share of the current
-#: that acceleration would then need.
-_NO_INERTIA, _MUCH = 0.5, 0.5
+#: early (it gains nothing), and number of parts of the curve.
+_LATE_BETTER, _EARLY_BETTER, _CURVE_PARTS = 2.0, 1.2, 60
 #: Radii of tyres, m: what vehicle speed over wheel speed is, of a scooter's to a truck's.
 _TYRE_M = (0.15, 0.8)
 #: Speeds of a wheel that turns, rad/s, at which the two are compared, and share of them that may be far from their median.
@@ -101,7 +84,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
 
     def series(message: str, signal: str) -> Series | None:
         found = messages.get(message.format(corner), {}).get(signal)
-        return found if isinstance(found, Series) and len(found.time_ns) >= _LEAST else None
+        return found if isinstance(found, Series) and len(found.time_ns) >= LEAST else None
 
     angle, current = series("EMB_{}_Resolver", "MotorAngle"), series("EMB_{}_Current", "CurrentQ")
     force = series("RIG_{}_Force", "ClampForceRef")
@@ -127,11 +110,11 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         stated, force = messages[f"RIG_{corner}_Force"]["ClampForceRef"], None
         load = float(stated.values[0]) if isinstance(stated, Series) else stated
     if speed is not None and current is not None and load is not None and (moves or (bare and speed.is_resolved)):
-        lines += _find_driving_friction(speed, current, load)
+        lines += find_driving_friction(speed, current, load)
     if moves and load is not None:
-        lines += _find_other_current(speed, current, load)
+        lines += find_other_current(speed, current, load)
         # What relaxes in pads looks like a delay.
-        lines += _find_late_current(speed, current, force) if bare else []
+        lines += find_late_current(speed, current, force) if bare else []
     if angle is None or angle.is_sparse or np.ptp(angle.values) < _TRAVEL_RAD:
         # A travel that is small, or unknown between two samples, does not show directions; current and force do.
         turned = [] if angle is None or bare or force is None or not np.ptp(force.values) else _find_turned_force(angle, force)
@@ -139,7 +122,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     if bare:
         return lines
     if current is not None and np.ptp(current.values):
-        lines += _find_unsigned(current) or _find_turned_current(angle, current)
+        lines += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
         lines += _find_turned_force(angle, force) or [*_find_untared(angle, force), *_find_late_force(angle, force)]
     return lines
@@ -149,85 +132,9 @@ def has_dead_current(corner: str, messages: dict[str, Signals]) -> bool:
     """Whether a corner's current is nothing but zero while its motor turns: friction alone would need some."""
     angle, current = (messages.get(f"EMB_{corner}_{name}", {}) for name in ("Resolver", "Current"))
     angle, current = angle.get("MotorAngle"), current.get("CurrentQ")
-    if not isinstance(angle, Series) or current is None or len(angle.values) < _LEAST or np.ptp(angle.values) < _TRAVEL_RAD:
+    if not isinstance(angle, Series) or current is None or len(angle.values) < LEAST or np.ptp(angle.values) < _TRAVEL_RAD:
         return False
     return not np.any(current.values if isinstance(current, Series) else current)
-
-
-def _in_motion(samples: Records, beside: np.ndarray) -> np.ndarray:
-    """Speed, current, acceleration and another signal, (n,), of SAMPLE rows in which the motor moves and all is known; none if
-    they are few, or so rare that it is accelerated and braked again between them."""
-    speed, current = (samples[name].astype(float) for name in ("speed", "current_q"))
-    acceleration = np.gradient(speed, 1e-9 * samples["time_ns"]) if len(samples) > 1 else np.zeros(len(samples))
-    every = np.stack([speed, current, acceleration, beside])
-    known = samples["has_current"] & np.isfinite(every[1:]).all(axis=0)
-    if not known.any() or Series(samples["time_ns"], speed).is_sparse:
-        return every[:, :0]
-    rows = np.flatnonzero(known & (np.abs(speed) > _MOVING * np.quantile(np.abs(speed[known]), 0.99)))[:_JUDGED]
-    return every[:, rows if len(rows) >= _LEAST else rows[:0]]
-
-
-def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2: float) -> list[str]:
-    """A line if the current accelerates the motor of SAMPLE rows as if its inertia were far from the one stated: then angle or
-    current is in another unit, of another place, or of another motor."""
-    speed, current, acceleration, angle = _in_motion(samples, samples["angle"].astype(float))
-    if not len(angle) or not np.ptp(angle):
-        return []
-    way = (angle - angle[0]) / np.ptp(angle)
-    known = np.column_stack([np.ones(len(way)), np.sign(speed), speed, way, way**2, way**3])
-    columns = np.column_stack([current, acceleration])
-    left = columns - known @ np.linalg.lstsq(known, columns)[0]
-    if not np.all(np.ptp(left, axis=0) > 0.0):
-        return []
-    correlation = float(np.corrcoef(left.T)[0, 1])
-    told_A, needed_A = np.std(left, axis=0) * (1.0, inertia_kg_m2 / torque_constant_Nm_per_A)
-    if needed_A > _MUCH * told_A and max(abs(correlation), abs(correlation) * told_A / needed_A) < _NO_INERTIA:
-        return [
-            f"the current does not accelerate the motor (correlation {correlation:.2f}): is it a phase's, a duty cycle, "
-            "without its sign, or of another time?"
-        ]
-    ratio = float(left[:, 0] @ left[:, 1] / (left[:, 1] @ left[:, 1])) * torque_constant_Nm_per_A / inertia_kg_m2
-    if abs(correlation) < _TOLD_INERTIA or 1.0 / _OTHER_INERTIA < ratio < _OTHER_INERTIA:
-        return []
-    if ratio < 0.0:
-        return [f"the current accelerates the motor backwards (correlation {correlation:.2f}): `scale: -1` of one of the two?"]
-    return [
-        f"the current accelerates the motor as if its inertia were {ratio:.3g} times what is stated: is the angle that of "
-        f"a gear's output, or in another unit (`scale: {ratio:.3g}` of angle and speed would agree), the current in another "
-        "unit, or is this another motor?"
-    ]
-
-
-def other_current(samples: Records, force_N: np.ndarray, motor: Motor) -> list[str]:
-    """A line if the current of SAMPLE rows is the same share of what the load and of what the acceleration need, and not one.
-
-    Other pads or friction change what a load needs, another inertia what acceleration needs; the scale of the current, as an
-    effective value's, changes both, and a torque constant within its tolerances neither by as much.
-
-    Args:
-        force_N: clamp force, (n,); NaN where it is not known.
-    """
-    speed, current, acceleration, force = _in_motion(samples, force_N)
-    if not len(force):
-        return []
-    rest = np.column_stack([np.ones(len(force)), np.sign(speed), speed, np.sign(speed) * force])
-    torques = {"load": motor.gear_gain_m_per_rad * force, "acceleration": motor.inertia_kg_m2 * acceleration}
-    explained = motor.torque_constant_Nm_per_A * current
-    shares = []
-    for name, torque in torques.items():
-        others = np.column_stack([rest, *(column for other, column in torques.items() if other != name)])
-        columns = np.column_stack([torque, explained])
-        left = columns - others @ np.linalg.lstsq(others, columns)[0]
-        if not np.all(np.ptp(left, axis=0) > 0.0) or np.corrcoef(left.T)[0, 1] < _TOLD_INERTIA:
-            return []
-        shares.append(float(left[:, 0] @ left[:, 1] / (left[:, 0] @ left[:, 0])))
-    share = float(np.sqrt(np.prod(shares)))
-    if abs(shares[0] / shares[1] - 1.0) > _SAME_SHARE or 1.0 / _OTHER_CURRENT < share < _OTHER_CURRENT:
-        return []
-    return [
-        f"the current is {share:.3g} times what load and acceleration need with the stated torque constant: is it an "
-        f"effective value, in another unit, or of another motor? `scale: {1.0 / share:.3g}` of CurrentQ would agree"
-    ]
 
 
 def _find_gaps(signals: dict[str, Series]) -> list[str]:
@@ -248,7 +155,7 @@ def _find_staying(angle: Series, force: Series) -> list[str]:
     """A line on the longest time for which a force stays to the bit while the motor turns, if it is another than that of a
     clearance: elsewhere it changes over the angles that are passed, or is less."""
     changes = np.concatenate([[0], np.flatnonzero(np.diff(force.values)) + 1, [len(force.values)]])
-    if len(changes) < _LEAST:
+    if len(changes) < LEAST:
         return []
     longest = int(np.argmax(np.diff(changes)))
     first, last = changes[longest], changes[longest + 1] - 1
@@ -278,7 +185,7 @@ def _find_other_wheel(corner: str, messages: dict[str, Signals]) -> list[str]:
         return []
     at = vehicle.sampled(wheel.time_ns)
     turns = np.isfinite(at) & (wheel.values > _TURNS_RAD_PER_S)
-    if np.sum(turns) < _LEAST:
+    if np.sum(turns) < LEAST:
         return []
     radii_m = at[turns] / wheel.values[turns]
     radius_m = float(np.median(radii_m))
@@ -303,7 +210,7 @@ def _find_impossible_temperatures(corner: str, messages: dict[str, Signals]) -> 
             lines.append(f"{name} is {middle:.4g} °C, which no backing plate lasts: an open thermocouple, or a wrong unit?")
         elif _KELVINS[0] < low < _KELVINS[1]:
             lines.append(f"{name} is never below {low:.4g} °C: are these kelvins? Then `unit: K`")
-        if len(values.values) >= _LEAST:
+        if len(values.values) >= LEAST:
             lines += _find_other_time(name, values)
     return lines
 
@@ -326,20 +233,9 @@ def _find_other_time(name: str, temperature: Series) -> list[str]:
     ]
 
 
-def _find_unsigned(current: Series) -> list[str]:
-    """A line on a current that jumps between the ends of its range, as a number with a sign does that is read without one."""
-    jump = starts_anew(current)
-    if not jump or np.min(current.values) < -_FOLLOWS * jump:
-        return []
-    return [
-        f"CurrentQ jumps by about {jump:.4g} A to and fro: is it a number with a sign that is read without one (the DBC says "
-        "unsigned)?"
-    ]
-
-
 def _find_late_force(angle: Series, force: Series) -> list[str]:
     """A line on a force that follows the angle later than pads do, or comes before it."""
-    times, values = force.time_ns[:_JUDGED], force.values[:_JUDGED]
+    times, values = force.time_ns[:JUDGED], force.values[:JUDGED]
     way = angle.sampled(times)
     way = way[np.isfinite(way)][:: max(len(times) // _PLACES, 1)]
     # A curve over an angle that goes one way is one over the time.
@@ -349,7 +245,7 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
     def left_N(lag_s: float, each_way: bool = False) -> float:
         at = angle.sampled(times - round(1e9 * lag_s))
         known = np.isfinite(at)
-        if np.sum(known) < _LEAST or not np.ptp(at[known]) or at[known] @ (values[known] - np.mean(values[known])) < 0.0:
+        if np.sum(known) < LEAST or not np.ptp(at[known]) or at[known] @ (values[known] - np.mean(values[known])) < 0.0:
             return np.inf
         part = np.minimum(_CURVE_PARTS * (at[known] - at[known].min()) / np.ptp(at[known]), _CURVE_PARTS - 1).astype(int)
         if each_way:
@@ -362,7 +258,7 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
     left = np.array([left_N(lag) for lag in lags])
     if not np.isfinite(left).any():
         return []
-    lag_s = float(_least_lag(lags, left))
+    lag_s = float(least_lag(lags, left))
     gain = left_N(0.0) / max(np.min(left), 1.0)
     if lag_s > _LATE_S and gain > _LATE_BETTER:
         return [
@@ -376,48 +272,6 @@ def _find_late_force(angle: Series, force: Series) -> list[str]:
             "two stamped by two clocks?"
         ]
     return []
-
-
-def _least_lag(lags: np.ndarray, left: np.ndarray) -> float:
-    """The least of the lags with which as little is ``left`` as with any: a motion that repeats itself has several."""
-    around = np.pad(left, 1, constant_values=np.inf)
-    near = lags[(left <= _AS_GOOD * np.min(left)) & (left <= around[:-2]) & (left <= around[2:])]
-    return near[np.argmin(np.abs(near))]
-
-
-def current_late_ms(current: Series, times: np.ndarray, columns: np.ndarray, longest_ms: int) -> int:
-    """Time by which a current comes after what explains it, ``columns`` (n, k) at some ``times`` (ns), negative if before; 0
-    if neither is sure, or it is ``longest_ms`` or more."""
-    lags_ms = np.arange(-longest_ms, longest_ms + 1)
-    every = len(times) // _COMPARED + 1
-    times, columns = times[::every], columns[::every]
-    values = np.stack([current.sampled(times + 1_000_000 * lag_ms) for lag_ms in lags_ms.tolist()], axis=1)
-    known = np.isfinite(columns).all(axis=1) & np.isfinite(values).all(axis=1)
-    if np.sum(known) < _LEAST:
-        return 0
-    explained, values = np.linalg.qr(columns[known])[0], values[known]
-    left_A = np.std(values - explained @ (explained.T @ values), axis=0)
-    late_ms, now_A = int(_least_lag(lags_ms, left_A)), left_A[longest_ms]
-    # At the end of the search it is no delay but a slow motion, in which all is alike.
-    sure = _LEAST_CURRENT_MS <= abs(late_ms) < longest_ms and now_A > _CURRENT_BETTER * np.min(left_A)
-    return late_ms if sure else 0
-
-
-def _find_late_current(speed: Series, current: Series, force: Series | None) -> list[str]:
-    """A line on a current of another time than the load and the acceleration that it explains."""
-    times = current.time_ns[:_JUDGED]
-    at, load = speed.sampled(times), np.zeros(len(times)) if force is None else force.sampled(times)
-    columns = np.stack([np.ones(len(times)), load, at, np.sign(at), np.gradient(at, 1e-9 * times)], axis=1)
-    late_ms = current_late_ms(current, times, columns, _BESIDE_MOTION_MS if force is None else _BESIDE_LOAD_MS)
-    if not late_ms:
-        return []
-    what, other = ("the acceleration", "are angle and speed") if force is None else ("the load", "is ClampForceRef")
-    if late_ms > 0.0:
-        return [f"CurrentQ comes {late_ms} ms after {what} that it belongs to: a `mean_ms` longer by {2 * late_ms}?"]
-    # A value of the moment that is taken for a mean since the last one comes half a period too early.
-    moment = "is it a value of the moment? Then `mean_ms: 0`; or " if -late_ms * 1e6 < current.period_ns else ""
-    told = f"CurrentQ comes {-late_ms} ms before {what} that it belongs to: {moment}{other} late?"
-    return [f"{told} Then `mean_ms: {-2 * late_ms}` there"]
 
 
 def _find_angle_unit(angle: Series) -> list[str]:
@@ -487,88 +341,16 @@ def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
     times = current.time_ns
     at, acceleration = force.sampled(times), np.gradient(speed.sampled(times), 1e-9 * times)
     known = np.isfinite(at) & np.isfinite(acceleration)
-    if np.sum(known) < _LEAST or not np.ptp(at[known]):
+    if np.sum(known) < LEAST or not np.ptp(at[known]):
         return []
     left = _without_inertia(current.values[known], at[known], acceleration[known])
     correlation = float(np.corrcoef(left, at[known])[0, 1]) if left is not None and np.ptp(left) else 0.0
-    if correlation > -_AGAINST:
+    if correlation > -AGAINST:
         return []
     return [
         f"ClampForceRef falls while CurrentQ rises (correlation {correlation:.2f}), and positive current clamps: "
         "`scale: -1` of one of the two?"
     ]
-
-
-def _find_driving_friction(speed: Series, current: Series, force: Series | float) -> list[str]:
-    """A line if the current that neither load nor inertia explains opposes the motion, which friction's does not."""
-    times = current.time_ns
-    at, load = speed.sampled(times), force.sampled(times) if isinstance(force, Series) else np.full(len(times), force)
-    moving = np.isfinite(load) & (np.abs(at) > _MOVING * np.nanquantile(np.abs(at), 0.99))
-    direction = np.sign(at[moving])
-    if min(np.sum(direction > 0.0), np.sum(direction < 0.0)) < _LEAST:
-        return []
-    known = np.stack([np.ones(len(times)), load, np.gradient(at, 1e-9 * times)], axis=1)[moving]
-    columns = np.column_stack([current.values[moving], direction])
-    left = columns - known @ np.linalg.lstsq(known, columns)[0]
-    correlation = float(np.corrcoef(left.T)[0, 1]) if np.all(np.ptp(left, axis=0) > 0.0) else 0.0
-    if correlation > -_AGAINST:
-        return []
-    # A current that is turned round opposes its load, too; a motion that is turned round does not turn what the load needs.
-    explaining = np.column_stack([known[:, 1:], direction, *([known[:, 0]] if isinstance(force, Series) else [])])
-    of_load_A_per_N = np.linalg.lstsq(explaining, columns[:, 0])[0][0]
-    return [
-        f"CurrentQ is less in the direction of motion than against it (correlation {correlation:.2f}), as if friction drove "
-        f"the motor: `scale: -1` of {'CurrentQ' if of_load_A_per_N < 0.0 else 'MotorAngle and MotorSpeed'}?"
-    ]
-
-
-def _find_other_current(speed: Series, current: Series, force: Series | float) -> list[str]:
-    """A line if the current goes with the power of load and acceleration instead of with themselves, as a supply's does, or
-    with the size of what they and friction need, as an effective value does."""
-    times = current.time_ns[:_JUDGED]
-    at, load = speed.sampled(times), force.sampled(times) if isinstance(force, Series) else np.full(len(times), force)
-    torques = np.stack([load, np.gradient(at, 1e-9 * times)], axis=1)
-    # The load of a propeller or a pump is one of the speed, and tells nothing then.
-    rest = np.stack([np.ones(len(times)), np.sign(at), at, at * np.abs(at)], axis=1)
-    known = np.isfinite(torques).all(axis=1) & np.isfinite(at)
-    if np.sum(known) < _LEAST:
-        return []
-    values = current.values[: len(times)][known]
-
-    def left_A(explaining: np.ndarray) -> float:
-        columns = np.hstack([rest, explaining])[known]
-        return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
-
-    by_load_A, by_power_A = left_A(torques), left_A(torques * at[:, None])
-    by_size_A = _left_by_size(values, np.hstack([rest[:, :3], torques])[known])
-    if by_load_A > _OTHERWISE * by_size_A and by_size_A < by_power_A:
-        return [
-            f"CurrentQ goes with the size of what load, friction and acceleration need, of which it leaves {by_size_A:.2g} A, "
-            f"and not with that itself, which leaves {by_load_A:.2g} A: a phase's, an effective value? The motor's has a sign"
-        ]
-    if not isinstance(force, Series) or not by_load_A > _OTHERWISE * by_power_A:
-        return []
-    return [
-        f"CurrentQ goes with the load times the speed, of which it leaves {by_power_A:.2g} A, and not with the load, which "
-        f"leaves {by_load_A:.2g} A: a drive takes such a current from its supply, and the motor's own is another"
-    ]
-
-
-def _left_by_size(values: np.ndarray, columns: np.ndarray) -> float:
-    """What is left of a current without its sign by the size of a sum of columns, (n, k), found from the signs of each of them
-    in turn; infinity if it has one."""
-    low, high = np.quantile(values, (0.01, 0.99))
-    if min(-low, high) > _OF_ONE_SIGN * max(-low, high):
-        return np.inf
-    values, columns = values[:: len(values) // _COMPARED + 1], columns[:: len(values) // _COMPARED + 1]
-    left = []
-    for first in columns.T:
-        needed = first
-        for _ in range(_SIGNS):
-            signed = np.where(needed < 0.0, -1.0, 1.0)[:, None] * columns
-            needed = columns @ np.linalg.lstsq(signed, values)[0]
-        left.append(float(np.std(values - np.abs(needed))))
-    return min(left)
 
 
 def starts_anew(angle: Series) -> float:
@@ -629,7 +411,7 @@ def _find_turned_current(angle: Series, current: Series) -> list[str]:
     acceleration = np.gradient(angle.derivative().values, 1e-9 * angle.time_ns)
     at = current.sampled(angle.time_ns)
     known = np.isfinite(at) & np.isfinite(acceleration)
-    if np.sum(known) < _LEAST:
+    if np.sum(known) < LEAST:
         return []
     left = _without_inertia(at[known], angle.values[known], acceleration[known])
     if left is None:

@@ -16,8 +16,11 @@ import numpy as np
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import j1939
 from emb_daemon.logs.columns import absent_raw
-from emb_daemon.logs.mapping import Mapping, Source, alone
-from emb_daemon.logs.resample import CARRIED_CYCLES, HEADER, cycle_ns, fill_missing, our_messages, unrepeated
+from emb_daemon.logs.foreign_frames import alone
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.mapping_file import Source
+from emb_daemon.logs.resample import HEADER, cycle_ns, fill_missing, our_messages, unrepeated
+from emb_daemon.logs.series import CARRIED_CYCLES
 from emb_daemon.runtime.bus import PythonCan, PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
@@ -42,13 +45,14 @@ class _Value:
     last: float = math.nan
     total: float = 0.0
     count: int = 0
-    _turned: float = math.nan
+    _turned: float = 0.0
 
     def take(self, raw: float, time_ns: int) -> None:
         period = self.source.period
-        if period is not None and math.isfinite(self._turned):
+        if period is not None:
             raw = self._turned + math.remainder(raw - self._turned, period)
-        self._turned = raw
+        if self.source.goes_on:
+            self._turned = raw
         self.last, self.heard_ns = self.source.scale * raw + self.source.offset, time_ns
         self.total += self.last
         self.count += 1

@@ -4,27 +4,22 @@ column.
 A foreign log has neither our ids nor E2E protection nor our sampling rate; `logs.resample` converts it to our messages.
 """
 
-import math
-import re
-from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-from msgspec import Meta, field
 
-from emb_daemon.calibration.fields import NonNegative, Positive, Struct
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.errors import InputError, InputErrors, tell
-from emb_daemon.logs import j1939
 from emb_daemon.logs.contradictions import contradictions, has_dead_current, starts_anew
 from emb_daemon.logs.dbc import load_foreign
-from emb_daemon.logs.read import Recorded, ids_in, read_log
+from emb_daemon.logs.foreign_frames import alone, decoded
+from emb_daemon.logs.mapping_file import Bus, Mapped, MappingFile, Source
+from emb_daemon.logs.read import ids_in, read_log
 from emb_daemon.logs.resample import (
     HEADER,
     SUBSTITUTES,
-    Series,
     filled,
     frames_of,
     is_bare,
@@ -32,13 +27,14 @@ from emb_daemon.logs.resample import (
     is_unresolved,
     our_messages,
     standing,
+    turns_free,
     way_of,
 )
-from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays
+from emb_daemon.logs.series import Series
+from emb_daemon.logs.stamps import no_values, strays, without_sign
 from emb_daemon.logs.tables import read_table
-from emb_daemon.wire.frames import ERROR, EXTENDED, REMOTE
 from emb_daemon.wire.layout import CORNERS, OURS, signal_columns
-from emb_daemon.wire.units import TRAVELS, UNITS, conversion, known_as, stated_in
+from emb_daemon.wire.units import TRAVELS, UNITS, conversion, stated_in
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -52,148 +48,6 @@ _SHORTEST_S, _LONGEST_S = 1e-5, 1.0
 _WHOLE_S = 1e-5
 #: Shortest period that another unit of time is suggested for, s; a day is what spreadsheets count in.
 _USUAL_S, _OF_TIME = 5e-4, ("s", "ms", "us", "ns", "d")
-#: Share of the payloads that may be missing in a gateway's copy, or at the beginning of a log.
-_LOST_COPIES = 0.1
-#: What DBCs call a raw value that is none, once words are apart; and a flag that says that all is well.
-_APART = re.compile(r"[\W_]+|(?<=[a-z])(?=[A-Z])")
-_NO_VALUE = re.compile(
-    r"(?i)\b(sna|n a|unavailable|(not|nicht) (available|valid|defined|used|verf.*)|invalid|undefined|unknown|reser\w*|init\w*|"
-    r"error\w*|fault\w*|fail\w*|(\w* )?fehler\w*|ung.ltig|no (data|signal|value))\b"
-)
-_FREE_OF = re.compile(r"(?i)(no|not|kein|ohne) (error|fault|fail|fehler)")
-
-
-class Mapped(Struct, kw_only=True):
-    """Where one of our signals comes from: a signal of the rig, or a constant."""
-
-    #: Message.Signal of the rig's DBC; without a DBC, the name of a column or channel.
-    signal: str | None = None
-    #: Which of `buses` carries it, if there are any.
-    bus: str | None = None
-    #: Its unit, where the rig's DBC states none or a wrong one; always for columns and channels.
-    unit: str | None = None
-    #: ours = scale * (theirs, in our unit) + offset; -1 turns a direction round.
-    scale: float = 1.0
-    #: In our unit.
-    offset: float = 0.0
-    #: What the value jumps by where it starts anew, in the rig's unit: 360 of an angle in degrees within one turn. Between two
-    #: samples it must move by less than half of it.
-    period: Positive | None = None
-    #: Time over which the value is a mean that ends with its stamp, ms, and twice the delay of a filter; 0 is a value of the
-    #: moment. Left out it is 0, and a sampling period for CurrentQ: a mean since the last frame, as on our bus.
-    mean_ms: NonNegative | None = None
-    #: A constant in our unit, for what the rig does not measure.
-    value: float | None = None
-
-    def __post_init__(self) -> None:
-        if (self.signal is None) == (self.value is None):
-            raise ValueError("expected either signal (of the rig) or value (a constant)")
-        alone = (self.unit, self.bus, self.period, self.mean_ms) == (None, None, None, None) and (self.scale, self.offset) == (
-            1.0,
-            0.0,
-        )
-        if self.value is not None and not alone:
-            raise ValueError("value: stands alone, in our unit")
-        if self.scale == 0.0:
-            raise ValueError("scale: 0 leaves nothing of the signal")
-
-
-class Time(Struct, kw_only=True):
-    """The column of times of a table, or how often a row was written."""
-
-    #: Name of the column.
-    signal: str | None = None
-    #: s, ms, us, ns, min, h or d: a spreadsheet counts days.
-    unit: str = "s"
-    #: Of a table without such a column: rows per second. Of one that counts instead of telling a time: counts per second.
-    rate_Hz: Positive | None = None
-    #: Of a table that has one value in a row: the column that names what was measured; `signals` then has such names.
-    name: str | None = None
-    #: Of such a table: the column of values.
-    value: str | None = None
-
-    def __post_init__(self) -> None:
-        if (self.name is None) != (self.value is None) or (self.name is not None and self.signal is None):
-            raise ValueError("expected name, value and signal together: the columns of a table with one value in a row")
-        if self.signal is None and self.rate_Hz is None:
-            raise ValueError("expected signal (a column), rate_Hz (rows per second), or both (a column's counts per second)")
-        if self.rate_Hz is not None and self.unit != "s":
-            raise ValueError("unit: counts have none; expected unit or rate_Hz")
-        if UNITS.get(self.unit, ("",))[0] != "s":
-            raise ValueError(f"unit: expected s, ms, us, ns, min, h or d, found {self.unit!r}")
-
-
-class Bus(Struct, kw_only=True):
-    """One of several CAN buses."""
-
-    #: Its DBC, ARXML or KCD, relative to this file.
-    dbc: str
-    #: Its channel as the log names it: can1 of candump, 1 of Vector's CAN 1; live, the one to open. Left out, it may be any.
-    channel: str | int | None = None
-
-
-class MappingFile(Struct, kw_only=True):
-    """mapping.yaml."""
-
-    #: Version of this file format.
-    format: Annotated[int, Meta(ge=1, le=1)]
-    #: The rig's DBC, ARXML or KCD, relative to this file; left out for tables and measurements.
-    dbc: str | None = None
-    #: Instead of `dbc`, of a rig with several buses: by a name of yours.
-    buses: dict[str, Bus] = field(default_factory=dict)
-    #: Of a table or of arrays; channels of an MDF measurement have times of their own.
-    time: Time | None = None
-    #: Our Message.Signal (dbc/emb.dbc, and dbc/rig.dbc for references): where it comes from.
-    signals: dict[str, Mapped]
-
-    def __post_init__(self) -> None:
-        if self.dbc is not None and self.buses:
-            raise ValueError("buses: each has a dbc of its own; expected dbc or buses")
-        if (self.dbc is not None or self.buses) and self.time is not None:
-            raise ValueError("time: the frames of a CAN log have theirs; expected one of dbc, buses and time")
-
-
-class Source:
-    """One foreign signal of a bus (None: the only one), its ``name`` in a DBC ``message`` and ``signal``, and how it becomes
-    ours: ``scale`` and ``offset`` from the rig's ``unit`` to our ``target``, ``span_ns`` None is a sampling period.
-
-    Raises:
-        InputError: the unit cannot become ours.
-    """
-
-    def __init__(self, mapped: Mapped, unit: str, target: str, span_ns: float | None):
-        self.name: str = mapped.signal
-        self.unit = unit
-        self.target = target
-        self.bus: str | None = mapped.bus
-        self.period: float | None = mapped.period
-        message, _, signal = mapped.signal.rpartition(".")
-        self.message: str = message
-        self.signal: str = signal
-        factor, shift = conversion(unit, target)
-        self.scale: float = mapped.scale * factor
-        self.offset: float = mapped.scale * shift + mapped.offset
-        self._shifted = mapped.offset != 0.0
-        self.span_ns = span_ns
-
-    def questioned(self, stated: str) -> str:
-        """A question if the unit that the rig states makes other values of the signal; a scale of that same unit is meant."""
-        own = known_as(stated)
-        if own and (UNITS[own][0], self.target) == ("Nm", "N") and UNITS[own][1] != 1.0:
-            return f"{self.name} says {own}, and an N·m is {1.0 / UNITS[own][1]:.4g} of it: is that in `scale`?"
-        if not own or UNITS[own][0] != UNITS[self.target][0]:
-            return ""
-        factor, zero = conversion(own, self.target)
-        as_stated = conversion(self.unit, self.target) == (factor, zero)
-        as_scaled = math.isclose(abs(self.scale), factor, rel_tol=1e-3) and (self._shifted or self.offset == zero)
-        return "" if as_stated or as_scaled else f"{self.name} says {own} and is taken in {self.unit}: which is right?"
-
-    def converted(self, time_ns: np.ndarray, values: np.ndarray) -> Series:
-        series = Series.of(time_ns, values)
-        if (sampled := held_rows(series.values)) is not None:
-            series = Series(series.time_ns[sampled], series.values[sampled])
-        turned = series.values if self.period is None else np.unwrap(series.values, period=self.period)
-        return Series(series.time_ns, self.scale * turned + self.offset).averaged(self.span_ns)
 
 
 class Mapping:
@@ -349,10 +203,12 @@ class Mapping:
                 else:
                     self.notes.append(f"{self.path}: {name} is constant: the motor stands throughout")
         for corner in corners:
-            for message, text in _LOST.items():
+            # What clamps nothing has neither pads nor a disc, and is never released.
+            asked = [_CURRENT] if turns_free(corner, self.messages) else _LOST
+            for message in asked:
                 if (name := message.format(corner)) not in self.messages:
                     blind = name == "VEH_Status" and f"EMB_{corner}_Current" not in self.messages
-                    self.notes.append(f"{self.path}: {name} is not mapped: {_BLIND if blind else text}")
+                    self.notes.append(f"{self.path}: {name} is not mapped: {_BLIND if blind else _LOST[message]}")
 
     def require_frames(self) -> None:
         """Raises InputError of a mapping of tables, which has no frames."""
@@ -397,12 +253,13 @@ class Mapping:
             self._question(path, units)
         else:
             recorded = read_log(path)
-            raw, digest = self._decode(path, recorded, wanted), recorded.digest
+            raw, digest = decoded(self, path, recorded, wanted), recorded.digest
         for (_, name), (stamps, values) in raw.items():
             if len(values) and np.any(none := no_values(values)):
                 these = ", ".join(f"{value:g}" for value in np.unique(values[none]))
                 tell(f"{path}: {name}: {np.sum(none)} values are {these}, which stand for none: left out")
                 raw[_, name] = stamps[~none], values[~none]
+        self._question_signs(path, raw)
         messages = {
             name: {
                 key: source.converted(*raw[source.bus, source.name]) if isinstance(source, Source) else source
@@ -436,6 +293,15 @@ class Mapping:
         # Recorders may have times before zero, before their trigger; our logs may not.
         frames["time_ns"] -= min(frames["time_ns"][0], 0)
         return frames, digest
+
+    def _question_signs(self, path: Path, raw: dict[tuple, tuple]) -> None:
+        """Say which signals have lost their sign, unless the mapping knows."""
+        for bus, name in {(s.bus, s.name): None for m in self.messages for s in self._sources(m).values() if s.period is None}:
+            if whole := without_sign(raw[bus, name][1]):
+                tell(
+                    f"{path}: {name} jumps between 0 and {whole:.10g}, the end of its bits: a number with a sign that is read "
+                    f"without one, or an angle that starts anew? Then `period: {whole:.10g}`"
+                )
 
     def _question(self, path: Path, units: dict[str, str]) -> None:
         """Say which units a file states that the mapping contradicts, of columns whose names state none."""
@@ -476,56 +342,6 @@ class Mapping:
             names[f"{source.name} ({', '.join(place)})" if place else source.name] = None
         return ", ".join(names)
 
-    def _decode(self, path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]) -> dict[tuple, tuple]:
-        """Times and values of the rig's signals by bus and name, without those in frames that are too short."""
-        found = {}
-        by_message: dict[tuple[str | None, str], list[str]] = {}
-        for bus, signal in sorted(wanted, key=str):
-            by_message.setdefault((bus, signal.rpartition(".")[0]), []).append(signal)
-        for (bus, name), signals in by_message.items():
-            message = self.databases[bus].get_message_by_name(name)
-            rows = self._rows(path, recorded, message, self.channels[bus])
-            in_group = j1939.is_group(message) and not np.any(recorded.frames["can_id"][rows] == message.frame_id)
-            payloads = recorded.payloads(rows)
-            readers = {signal: alone(message, signal.rpartition(".")[2]) for signal in signals}
-            columns = {signal: np.array([read(payload) for payload in payloads]) for signal, read in readers.items()}
-            if in_group or message.protocol == "j1939":
-                parameters = {signal: message.get_signal_by_name(signal.rpartition(".")[2]) for signal in columns}
-                columns = {signal: j1939.known(parameters[signal], values) for signal, values in columns.items()}
-            # Each multiplexed part counts as a message of its own.
-            for part in [[signal] for signal in columns] if message.is_multiplexed() else [list(columns)]:
-                heard = np.any([np.isfinite(columns[signal]) for signal in part], axis=0)
-                values = [columns[signal][heard] for signal in part]
-                stamps, kept = in_time(f"{path}: {', '.join(part)}", recorded.frames["time_ns"][rows[heard]], values)
-                found |= {(bus, signal): (stamps, column[kept]) for signal, column in zip(part, values, strict=True)}
-        return found
-
-    def _rows(self, path: Path, recorded: Recorded, message, channel: str | None) -> np.ndarray:
-        """Of a message's frames. Raises InputError: the log has nothing of the channel, or the message comes from two channels
-        or senders and the mapping names none."""
-        frames = recorded.frames
-        flags = frames["flags"] & (EXTENDED | REMOTE | ERROR)
-        of_kind = flags == EXTENDED * message.is_extended_frame
-        mine = of_kind & (frames["can_id"] == message.frame_id)
-        if not mine.any() and j1939.is_group(message):
-            mine = of_kind & (j1939.group_of(frames["can_id"]) == j1939.group_of(message.frame_id))
-            if len(senders := np.unique(frames["can_id"][mine])) > 1:
-                raise InputError(
-                    f"{path}: {message.name} comes from several senders, as {', '.join(map(hex, senders.tolist()))}; give "
-                    "it the right one's id in the DBC"
-                )
-        channels = recorded.channels
-        if channel is not None:
-            if channel not in (known := np.unique(channels).tolist()):
-                raise InputError(f"{path}: nothing of channel {channel}, which {self.path} names; found {', '.join(known)}")
-            mine &= channels == channel
-        elif len(known := np.unique(channels[mine]).tolist()) > 1 and not _is_copied(recorded, mine, channels):
-            raise InputError(
-                f"{path}: {message.name} ({message.frame_id:#x}) comes from channels {', '.join(known)}, and not the same; "
-                f"name the right one in {self.path} (`buses:`, `channel`)"
-            )
-        return np.flatnonzero(mine)
-
 
 def _per_radius(unit: str) -> str:
     """Radians a second of a wheel of one metre of radius, of a speed of its tyre of one, as a number in words."""
@@ -533,46 +349,6 @@ def _per_radius(unit: str) -> str:
         return f"{conversion(unit, 'm/s')[0]:.4g}"
     except InputError:
         return "its m/s"
-
-
-def alone(message: "Message", name: str) -> Callable[[bytes], float]:
-    """Function that reads one signal of a message (cantools) from a payload, even if others overlap with it in the DBC; NaN if
-    the payload is too short or belongs to other multiplexed signals, or if the DBC calls the value one that is not available.
-
-    Raises:
-        cantools.database.Error: the message has no room for it.
-    """
-    from cantools.database import DecodeError
-    from cantools.database.can import Message
-
-    signal = message.get_signal_by_name(name)
-    if not message.is_multiplexed():
-        message = Message(
-            message.frame_id, message.name, message.length, [signal], is_extended_frame=message.is_extended_frame
-        )
-    nothing = {
-        float(signal.raw_to_scaled(raw, decode_choices=False))
-        for raw, choice in (signal.choices or {}).items()
-        if _NO_VALUE.search(text := _APART.sub(" ", str(choice))) and not _FREE_OF.match(text)
-    }
-
-    def read(payload: bytes) -> float:
-        try:
-            value = float(message.decode(payload, decode_choices=False, allow_truncated=True).get(name, np.nan))
-        except DecodeError:
-            return np.nan
-        return np.nan if value in nothing else value
-
-    return read
-
-
-def _is_copied(recorded: Recorded, mine: np.ndarray, channels: np.ndarray) -> bool:
-    """Whether two channels carry the same frames of a message: a gateway's copy, or two loggers of one bus."""
-    rows = np.flatnonzero(mine)
-    payloads = np.array([payload.hex() for payload in recorded.payloads(rows)])
-    by_channel = [set(payloads[channels[rows] == channel].tolist()) for channel in np.unique(channels[rows])]
-    fewest = min(by_channel, key=len)
-    return all(len(fewest - other) <= _LOST_COPIES * len(fewest) for other in by_channel)
 
 
 def _too_slow(corner: str, messages: dict) -> list[str]:
@@ -596,8 +372,9 @@ def _too_slow(corner: str, messages: dict) -> list[str]:
 
 _BENCH = "of a bench say so by `value: 0` of ParkBrake, BrakeRequest and VehicleSpeed, beside AmbientTemp"
 #: What a corner loses with a message that is not mapped.
+_CURRENT = "EMB_{}_Current"
 _LOST = {
-    "EMB_{}_Current": "the force rests on the motor angle alone",
+    _CURRENT: "the force rests on the motor angle alone",
     "EMB_{}_Thermocouple": "the pads' temperature is unknown, and sigma holds what it may do",
     "VEH_WheelSpeed": "the disc may be turning and heating, and sigma grows; of one that stands say so by `value: 0`",
     "VEH_Status": "that the brake was released has to be shown by motor and current; " + _BENCH,

@@ -31,12 +31,32 @@ from emb_daemon.wire.frames import ERROR, EXTENDED, FD, FRAME, REMOTE, row_of
 _BEGINNINGS = {
     b"LOGG": ".blf", b"MDF     ": ".mf4", b"UnFinMF ": ".mf4", b";$FILEVERSION": ".trc", b"(": ".log", b"date ": ".asc",
 }  # fmt: skip
+#: How archives begin, and workbooks and NumPy's, which are such.
+ZIP = b"PK\x03\x04"
 #: First bytes of a packed file: its packer, and what opens it.
 _PACKED = {
     b"\x1f\x8b": ("gzip", lambda file: gzip.GzipFile(fileobj=file)),
     b"BZh": ("bzip2", bz2.BZ2File),
     b"\xfd7zXZ": ("xz", lzma.LZMAFile),
 }
+#: Where and how what nothing here reads begins, what it is, and what would do.
+_OF_MESSAGES, _ARCHIVE = "expected what it holds as CSV, Parquet or .mat", "unpack it first"
+_UNREAD = (
+    (0, b"#ROSBAG", "a ROS bag", _OF_MESSAGES),
+    (0, b"\x89MCAP", "a ROS 2 bag", _OF_MESSAGES),
+    (0, b"SQLite format 3", "a database, as ROS 2 bags are", _OF_MESSAGES),
+    (0, b"\x80\x04\x95", "a pickle of Python", _OF_MESSAGES),
+    (0, b"\x80\x05\x95", "a pickle of Python", _OF_MESSAGES),
+    (0, b"%PDF", "a PDF", _OF_MESSAGES),
+    (0, b"<!DOCTYPE html", "a web page", "download the file itself"),
+    (0, b"<html", "a web page", "download the file itself"),
+    (0, b"version https://git-lfs", "a pointer of Git LFS to a file that is not here", "`git lfs pull` fetches that"),
+    (0, b"7z\xbc\xaf", "a 7z archive", _ARCHIVE),
+    (0, b"Rar!", "a RAR archive", _ARCHIVE),
+    (0, b"\x28\xb5\x2f\xfd", "packed by zstd", _ARCHIVE),
+    (0, b"\x04\x22\x4d\x18", "packed by lz4", _ARCHIVE),
+    (257, b"ustar", "a tar archive", _ARCHIVE),
+)
 #: How python-can's tables begin; number of bytes shown of a text that does not.
 _CSV, _SHOWN_BYTES = b"timestamp,arbitration_id", 60
 #: Number of ids listed if the expected ones are not in a log.
@@ -70,7 +90,15 @@ def read_file(path: Path) -> bytes:
 
 def unpack(path: Path, raw: bytes) -> bytes:
     """A file's bytes, unpacked if it was packed, whatever it is called; a truncated one up to its end. Raises InputError:
-    damaged, or too large once it is unpacked."""
+    damaged, too large once it is unpacked, or of a kind that nothing here reads."""
+    content = _unpacked(path, raw)
+    for at, begins, what, would_do in _UNREAD:
+        if content.startswith(begins, at):
+            raise InputError(f"{path}: is {what}, which is not read; {would_do}")
+    return content
+
+
+def _unpacked(path: Path, raw: bytes) -> bytes:
     packer, opened = next((how for beginning, how in _PACKED.items() if raw.startswith(beginning)), ("", None))
     if opened is None:
         return raw
@@ -246,9 +274,12 @@ def read_log(path: str | Path) -> Recorded:
     if rewritten := as_candump(content):
         content = rewritten
     ending = ".log" if rewritten else ending_of_content(content) or log_ending(path)
-    if ending not in LOG_ENDINGS:
+    if ending not in LOG_ENDINGS or content.startswith(ZIP):
         known = ".log, .log.gz, .asc, .blf, .trc or .mf4"
-        raise InputError(f"{path}: unknown log format, expected {known}, or --mapping of a table's columns (without dbc)")
+        raise InputError(
+            f"{path}: unknown log format, expected {known} (unpack an archive first), or --mapping of a table's columns "
+            "(without dbc)"
+        )
     frames, octets, channels = _PARSERS[ending](path, content)
     if not len(frames):
         raise InputError(f"{path}: holds no frames")

@@ -5,15 +5,15 @@ pipeline is the only way into the estimator.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from emb_daemon.errors import tell
 from emb_daemon.jit import njit
-from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right, nearest, shipped_database
+from emb_daemon.logs.columns import Decoder, absent_raw, crc_is_right, shipped_database
+from emb_daemon.logs.series import CARRIED_PERIODS, LEAST_SAMPLES, RESOLVED, SAME_PERIOD, SPARSE_CYCLES, Series, correlation_of
 from emb_daemon.wire.contract import CYCLE_NS, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME
@@ -22,21 +22,9 @@ from emb_daemon.wire.layout import CORNERS, signal_columns
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
 
-#: Relative deviation of a rig's sampling period from ours up to which its samples are used unchanged.
-_SAME_PERIOD = 0.05
-#: Sampling period, in cycles, from which a fast motion between two samples is unknown: such samples are used unchanged too,
-#: and the estimator bridges the gaps. A brake clamps in some fifty cycles.
-_SPARSE_CYCLES = 5
-#: Sampling period up to which slow motion is filled in between its samples: a stop that comes and goes takes longer, ns. Share
-#: of the samples in motion by which slow motion is told, and angle by which the straight line between two may miss the way:
-#: some 20 N at a kilonewton per radian, the noise of a reference sensor, rad.
-_LONGEST_FILLED_NS, _RESOLVED_SHARE, _UNKNOWN_WAY_RAD = 101_000_000, 0.99, 0.01
-#: Share of the way between two samples that the straight line may miss of a machine that clamps nothing: its current tells of
-#: load, speed and acceleration, and no force of its angle. Least share of a load that the other sign's is where it pulls as it
-#: pushes; what our message of the angle carries, more than the travel of anything that clamps, rad.
-_UNKNOWN_SHARE, _OTHER_SIGN, _CLAMPS_RAD = 0.1, 0.2, 3355.0
-#: Longest gap, in nominal cycles of our message or in periods of theirs, over which a value is held.
-CARRIED_CYCLES, _CARRIED_PERIODS = 5, 3
+#: Least share of a load that the other sign's is where it pulls as it pushes; what our message of the angle carries, more than
+#: the travel of anything that clamps, rad.
+_OTHER_SIGN, _CLAMPS_RAD = 0.2, 3355.0
 #: Share of values outside our message's range that is too large for faults of an instrument; what a flag may be off by.
 _MOST_BEYOND, _FLAG = 0.01, 0.01
 #: Share of our message's range that a value may be below it and is sent as its end: a zero error. A wheel turns from more.
@@ -49,9 +37,8 @@ _MISSING, _FOLLOWED = 0.25, 0.2
 _SILENT_NS = 3_600_000_000_000
 #: Sampling period of a standing motor of which nothing was measured, ns.
 _STANDING_NS = 1_000_000_000
-#: Least number of samples from which a log's rate is computed, and least share of them with consecutive counters: a working
-#: bus loses few frames.
-_LEAST_SAMPLES, _IN_TURN = 50, 0.9
+#: Least share of a log's samples with consecutive counters: a working bus loses few frames.
+_IN_TURN = 0.9
 #: Number of periods from which a step of time is a pause.
 _PAUSE = 10
 #: A step of the angle that differs from the integrated speed by more than this angle (rad), plus the change of speed times the
@@ -63,13 +50,8 @@ _SLIP_RAD, _SLIP_DELAY_S, _MOST_APART, _MOST_APART_BARE = 0.3, 0.01, 0.002, 0.02
 #: Travel from which the angle's derivative is compared with the speed, rad; least correlation of both; largest deviation of
 #: their ratio from 1, of which a filter's delay causes some hundredths, and from that of a unit that is then named.
 _WAY_RAD, _CORRELATED, _OTHER_SCALE, _NAMED = 1.0, 0.8, 0.1, 0.04
-#: Correlation of a speed with its next sample from which the mean of the two is the speed between them: of a sine it is the
-#: cosine of the phase that passes, and at 0.95 (20 samples a period) the mean is 3 % small.
-_RESOLVED = 0.95
 #: Number of sparse samples over which angle and speed are compared: the jitter of their stamps is a tenth as large beside it.
 _AVERAGED = 10
-#: Relative variation of a constant value by rounding.
-_STEADY = 1e-6
 #: Ratios of units that are often confused.
 _RATIOS = {
     30.0 / np.pi: "rpm taken for rad/s, or the reverse",
@@ -85,171 +67,6 @@ STEP_RAD_PER_S = 0.02
 HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
 _SLOW_MS = 40
-
-
-@dataclass(frozen=True)
-class Series:
-    """One signal, in our unit: int64 nanoseconds, ascending, and float values, shape (n,).
-
-    Each value is that of its time, or a mean about it.
-    """
-
-    time_ns: np.ndarray
-    values: np.ndarray
-
-    @classmethod
-    def of(cls, time_ns: np.ndarray, values: np.ndarray) -> "Series":
-        """Instantaneous values in any order; NaN values are left out."""
-        known = np.isfinite(values)
-        order = np.argsort(time_ns[known], kind="stable")
-        return cls(time_ns[known][order], values[known][order])
-
-    def averaged(self, span_ns: float | None = None) -> "Series":
-        """The same values as means over ``span_ns`` that end at their stamps; None is the sampling period."""
-        span_ns = self.period_ns if span_ns is None else span_ns
-        return Series(self.time_ns - round(0.5 * span_ns), self.values)
-
-    @cached_property
-    def period_ns(self) -> float:
-        return float(np.median(np.diff(self.time_ns))) if len(self.time_ns) > 2 else float(CYCLE_NS)
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether it is sampled at our rate."""
-        return abs(self.period_ns / CYCLE_NS - 1.0) <= _SAME_PERIOD
-
-    def held(self, at_ns: np.ndarray, cycle_ns: int) -> np.ndarray:
-        """The last value at each time, NaN if it is too old."""
-        if not len(self.time_ns):
-            return np.full(len(at_ns), np.nan)
-        row = np.searchsorted(self.time_ns, at_ns, side="right") - 1
-        age = at_ns - self.time_ns[np.maximum(row, 0)]
-        fresh = (row >= 0) & (age <= max(CARRIED_CYCLES * cycle_ns, _CARRIED_PERIODS * self.period_ns))
-        return np.where(fresh, self.values[np.maximum(row, 0)], np.nan)
-
-    def sampled(self, at_ns: np.ndarray) -> np.ndarray:
-        """The value at each time, straight between samples, NaN in gaps."""
-        return np.where(self._near(at_ns), self._between(at_ns), np.nan)
-
-    @property
-    def is_sparse(self) -> bool:
-        """Whether a fast motion's way between two samples is unknown."""
-        return self.period_ns >= (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
-
-    @property
-    def way_is_unknown(self) -> bool:
-        """Whether an angle's way between two samples is unknown: sparse samples of a motion that they do not resolve."""
-        return self._misses > max(_UNKNOWN_WAY_RAD, self._step)
-
-    @property
-    def course_is_unknown(self) -> bool:
-        """The same of a machine that clamps nothing."""
-        return self._misses > max(_UNKNOWN_WAY_RAD, self._step, _UNKNOWN_SHARE * self._goes)
-
-    @cached_property
-    def _step(self) -> float:
-        """Least difference of two values: a coarse encoder's count, of which the angle is not sure either."""
-        return float(np.min(np.diff(found))) if len(found := np.unique(self.values)) > 1 else 0.0
-
-    @cached_property
-    def _goes(self) -> float:
-        """How far it goes between two samples where it goes furthest."""
-        return float(np.quantile(np.abs(np.diff(self.values)), _RESOLVED_SHARE)) if len(self.values) > 1 else 0.0
-
-    @cached_property
-    def _misses(self) -> float:
-        """How far the straight line between sparse samples misses the way; infinite if they are too few to tell.
-
-        Left out, a sample of a smooth motion would be missed by the straight line between its neighbours four times as far as
-        the straight line between samples misses the way."""
-        if not self.is_sparse:
-            return 0.0
-        if self.period_ns > _LONGEST_FILLED_NS or len(self.values) < _LEAST_SAMPLES:
-            return np.inf
-        # Samples of a busy computer are not evenly apart.
-        share = (self.time_ns[1:-1] - self.time_ns[:-2]) / np.maximum(self.time_ns[2:] - self.time_ns[:-2], 1)
-        missed = 0.25 * np.abs(self.values[1:-1] - self.values[:-2] - share * (self.values[2:] - self.values[:-2]))
-        # Long standstill does not show how stops are sampled.
-        moving = np.maximum(missed, np.abs(self.values[2:] - self.values[:-2])) > _UNKNOWN_WAY_RAD
-        return float(np.quantile(missed[moving], _RESOLVED_SHARE)) if moving.any() else 0.0
-
-    @cached_property
-    def is_resolved(self) -> bool:
-        """Whether it changes little from one value to the next, so that the mean of the two is what was between them."""
-        return len(self.values) > 2 and _correlation(self.values[1:], self.values[:-1]) > _RESOLVED
-
-    @property
-    def is_slow(self) -> bool:
-        """Whether it is sampled more slowly than we do."""
-        return self.period_ns > (1.0 + _SAME_PERIOD) * CYCLE_NS
-
-    def smoothed(self, at_ns: np.ndarray) -> np.ndarray:
-        """Of a slow signal: mean over a period about each time, NaN in gaps.
-
-        Its change over a cycle is then that of means over periods, interpolated between their middles, as in `mean` for the
-        current, so that speed and current of a slow rig give the same inertia.
-        """
-        half = round(0.5 * self.period_ns)
-        if not len(self.time_ns):
-            return np.full(len(at_ns), np.nan)
-        # Linear on either side of the only corner in the period.
-        corner = np.clip(self.time_ns[nearest(self.time_ns, at_ns)], at_ns - half, at_ns + half)
-        share = (corner - at_ns + half) / (2.0 * half)
-        before, at, after = self._between(at_ns - half), self._between(corner), self._between(at_ns + half)
-        mean = 0.5 * (share * (before + at) + (1.0 - share) * (at + after))
-        return np.where(self._near(at_ns), mean, np.nan)
-
-    def mean(self, at_ns: np.ndarray) -> np.ndarray:
-        """Mean over the cycle that ends at each time, NaN in gaps.
-
-        A value that is sampled at our rate represents the period about its time, so that means over periods add up to means
-        over cycles; slower values are interpolated linearly.
-        """
-        if not len(self.time_ns):
-            return np.full(len(at_ns), np.nan)
-        middle = at_ns - CYCLE_NS // 2
-        if self.is_slow:
-            # Simpson's rule: at most one corner of the straight lines lies in a cycle.
-            mean = (self._between(at_ns - CYCLE_NS) + 4.0 * self._between(middle) + self._between(at_ns)) / 6.0
-        else:
-            times = (self.time_ns - self.time_ns[0]).astype(float)
-            half = 0.5 * self.period_ns
-            edges = np.concatenate([[times[0] - half], 0.5 * (times[1:] + times[:-1]), [times[-1] + half]])
-            area = np.concatenate([[0.0], np.cumsum(self.values * np.diff(edges))])
-            end = (at_ns - self.time_ns[0]).astype(float)
-            start = np.clip(end - CYCLE_NS, *edges[[0, -1]])
-            end = np.clip(end, *edges[[0, -1]])
-            mean = (np.interp(end, edges, area) - np.interp(start, edges, area)) / np.maximum(end - start, 1.0)
-        if self.is_ours:
-            # A mean over our own cycle is used unchanged, whatever the jitter of its stamp.
-            row = nearest(self.time_ns, middle)
-            mean = np.where(np.abs(self.time_ns[row] - middle) < CYCLE_NS // 4, self.values[row], mean)
-        return np.where(self._near(middle), mean, np.nan)
-
-    def derivative(self) -> "Series":
-        """Change per second, central over a cycle or over two periods, whichever is longer."""
-        half = max(CYCLE_NS // 2, round(self.period_ns))
-        first, last = (int(self.time_ns[0]), int(self.time_ns[-1])) if len(self.time_ns) else (0, 0)
-        after, before = np.minimum(self.time_ns + half, last), np.maximum(self.time_ns - half, first)
-        change = self._between(after) - self._between(before)
-        return Series(self.time_ns, change / np.maximum(1e-9 * (after - before), 1e-9))
-
-    def integral(self) -> "Series":
-        """Area under the signal since its first value."""
-        steps = 0.5 * (self.values[1:] + self.values[:-1]) * (1e-9 * np.diff(self.time_ns))
-        return Series(self.time_ns, np.concatenate([np.zeros(min(len(self.values), 1)), np.cumsum(steps)]))
-
-    def _between(self, at_ns: np.ndarray) -> np.ndarray:
-        if not len(self.time_ns):
-            return np.full(len(at_ns), np.nan)
-        origin = self.time_ns[0]
-        return np.interp((at_ns - origin).astype(float), (self.time_ns - origin).astype(float), self.values)
-
-    def _near(self, at_ns: np.ndarray) -> np.ndarray:
-        if not len(self.time_ns):
-            return np.zeros(len(at_ns), bool)
-        apart = np.abs(self.time_ns[nearest(self.time_ns, at_ns)] - at_ns)
-        return apart <= max(CYCLE_NS, _CARRIED_PERIODS * self.period_ns)
 
 
 #: Signals of one of our messages: where they come from, a constant, or None for an instrument that the rig does not have.
@@ -311,7 +128,7 @@ def _another_motion(angle: Series, speed: Series, bare: bool) -> str:
     how far a speed that changes slowly goes."""
     steps = np.diff(angle.time_ns)
     # What a busy computer stamps late it makes up for in the next rows: neither is left out.
-    near = (steps > 0) & (steps <= (_PAUSE if angle.is_sparse else _CARRIED_PERIODS) * angle.period_ns)
+    near = (steps > 0) & (steps <= (_PAUSE if angle.is_sparse else CARRIED_PERIODS) * angle.period_ns)
     at = speed.sampled(angle.time_ns)
     way, turned = np.diff(angle.values), 0.5e-9 * (at[1:] + at[:-1]) * steps
     known = near & np.isfinite(turned)
@@ -323,8 +140,8 @@ def _another_motion(angle: Series, speed: Series, bare: bool) -> str:
     moved, explained = float(np.sum(np.abs(went))), float(np.sum(np.abs(told)))
     # The sum of noise is no travel.
     if min(moved, explained) > _WAY_RAD and abs(ratio := float(went @ told / (told @ told))) > 0.0:
-        correlation = _correlation(went, told)
-        resolved = _correlation(at[1:][known], at[:-1][known]) > _RESOLVED
+        correlation = correlation_of(went, told)
+        resolved = correlation_of(at[1:][known], at[:-1][known]) > RESOLVED
         if resolved and abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
             return f"is another motion than MotorAngle, which changes {ratio:.4g} times as fast ({_meaning(ratio)})"
     if angle.is_sparse:
@@ -336,13 +153,6 @@ def _another_motion(angle: Series, speed: Series, bare: bool) -> str:
     return (
         f"is another motion than the change of MotorAngle in {100.0 * share:.1f} % of the samples (stamps of a busy computer?)"
     )
-
-
-def _correlation(one: np.ndarray, other: np.ndarray) -> float:
-    """Of two columns that are not zero throughout; about zero where one of them does not vary, as of a steady speed."""
-    if all(np.ptp(column) > _STEADY * np.max(np.abs(column)) for column in (one, other)):
-        one, other = one - np.mean(one), other - np.mean(other)
-    return float(one @ other / np.sqrt((one @ one) * (other @ other)))
 
 
 def _meaning(ratio: float) -> str:
@@ -428,7 +238,7 @@ def _has_another_rate(resolver: np.ndarray) -> bool:
     """Whether a single sender sends a corner's resolver frames at another rate that is high enough to interpolate.
 
     Counters of two senders, or of repeated frames, do not increase by one."""
-    if len(resolver) < _LEAST_SAMPLES:
+    if len(resolver) < LEAST_SAMPLES:
         return False
     counters = (resolver["data"] >> np.uint64(8) & np.uint64(0xF)).astype(int)
     in_turn = np.diff(counters) % COUNTER_MODULO == 1
@@ -438,7 +248,7 @@ def _has_another_rate(resolver: np.ndarray) -> bool:
     # The mean without pauses, in which a busy machine's delays cancel, unlike in the median.
     middle = np.median(steps)
     cycles = np.mean(steps[steps <= max(_PAUSE * middle, _PAUSE * CYCLE_NS)]) / CYCLE_NS
-    return abs(cycles - 1.0) > _SAME_PERIOD and middle < (1.0 - _SAME_PERIOD) * _SPARSE_CYCLES * CYCLE_NS
+    return abs(cycles - 1.0) > SAME_PERIOD and middle < (1.0 - SAME_PERIOD) * SPARSE_CYCLES * CYCLE_NS
 
 
 def is_received(message: str) -> bool:
@@ -496,13 +306,15 @@ def _frames(message, database, signals: Signals, ticks: dict, stretches: list[tu
             column = np.broadcast_to(np.asarray(source, float), times.shape)
             if name == "MotorAngle":
                 column = _within(message.name, column, layout["low"], layout["high"])
-            below = layout["low"] - column
-            column = np.where((below > 0.0) & (below < _ZERO_ERROR * (layout["high"] - layout["low"])), layout["low"], column)
+            rounding = _FLAG if length == 1 else 0.5 * layout["factor"]
+            below = max(rounding, _ZERO_ERROR * (layout["high"] - layout["low"]))
+            at_end = (column > layout["low"] - below) & (column < layout["high"] + rounding)
+            column = np.where(at_end, np.clip(column, layout["low"], layout["high"]), column)
             known = (column >= layout["low"]) & (column <= layout["high"])
             if (beyond := np.mean(np.isfinite(column) & ~known)) > _MOST_BEYOND:
                 so = "count as not measured" if is_reference else "make no frames"
                 much = np.max(np.abs(column[np.isfinite(column)])) / layout["high"]
-                smaller = f" If so, a `scale` {much:.2g} times smaller would fit, with all that it is compared with"
+                smaller = f" If so, a `scale` {much:.3g} times smaller would fit, with all that it is compared with"
                 tell(
                     f"{message.name}: {name} is beyond {layout['low']:g} to {layout['high']:g} in {100.0 * beyond:.3g} % of "
                     f"the samples, which {so}; is its unit right?{smaller if much > 1.0 else ''}"
@@ -621,4 +433,4 @@ def _clock(angle: Series, unresolved: bool) -> tuple[np.ndarray, np.ndarray]:
         return times, np.arange(len(times))
     if angle.is_ours or unresolved:
         return times, _numbered(times)
-    return _grid(_stretches(times, _CARRIED_PERIODS * angle.period_ns), CYCLE_NS)
+    return _grid(_stretches(times, CARRIED_PERIODS * angle.period_ns), CYCLE_NS)

@@ -6,7 +6,8 @@ import numpy as np
 
 from emb_daemon.errors import InputError
 from emb_daemon.logs.live import open_buses
-from emb_daemon.logs.mapping import Mapping, Source
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.mapping_file import Source
 from emb_daemon.logs.resample import our_messages
 from emb_daemon.runtime.bus import PythonCan, PythonCanBus
 from emb_daemon.wire.layout import signal_columns, unpack

@@ -36,6 +36,9 @@ _NO_MEASUREMENT, _AWAY = 1e20, 0.3
 #: least share of all others that are smaller: rows are filled wherever the value is (a half, give or take 0.07 of 50 times),
 #: while a dead band, or a force that is cut off when it is small, begins and ends at the smallest.
 _LEAST_FILLED, _JUMPS, _ANYWHERE = 50, 3.0, 0.25
+#: Least number of bits that lose a sign, part in the middle of their range in which nothing is then, and share of values that
+#: may be there.
+_LEAST_BITS, _BETWEEN, _ASTRAY = 12, 0.25, 0.01
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4
 
@@ -148,6 +151,21 @@ def no_values(values: np.ndarray) -> np.ndarray:
         if anywhere and np.sum(filled) > max(_LEAST_FILLED, 0.5 * len(filled)):
             none |= zero
     return none
+
+
+def without_sign(values: np.ndarray) -> float:
+    """What a column, shape (n,), as it was recorded, jumps by if its numbers lost their sign or count on within some bits: the
+    end of these bits; otherwise 0."""
+    steps = np.diff(np.unique(values))
+    if not len(steps) or np.min(values) < 0.0:
+        return 0.0
+    step = 1.0 if np.all(values == np.rint(values)) else np.min(steps)
+    # As float32 the last numbers before the end of 32 bits are a little beyond it.
+    bits = np.ceil(np.log2((1.0 - 1e-6) * np.max(values) / step))
+    whole = float(step * 2.0**bits)
+    between = np.mean(np.abs(values - 0.5 * whole) < 0.5 * _BETWEEN * whole)
+    jumps = np.max(np.abs(np.diff(values))) > (1.0 - _BETWEEN) * whole
+    return whole if bits >= _LEAST_BITS and jumps and between < _ASTRAY else 0.0
 
 
 def held_rows(values: np.ndarray) -> np.ndarray | None:
