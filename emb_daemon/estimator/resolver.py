@@ -15,6 +15,8 @@ from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 #: what a contact angle jumps by at once), is no motion.
 SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
+#: Share of the largest speed that a motor gains within a cycle only if its angle says so: it would be there within 16 ms.
+_GAINED = 0.25
 #: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
 #: this many seconds between both: 12 turns a second without speed. Standard deviation of such a jump, rad.
 SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
@@ -41,11 +43,12 @@ _REPEATED = 3
 
 @njit
 def believe_speed(s: Record, p: Record, m: Record) -> None:
-    """Replace a speed that no torque causes within a cycle, driving or braking with what holds the largest force. The last
-    speed goes on, unless the angle says the same as this one; if the last one was wrong, too, the angle tells the speed."""
-    possible = 2.0 * p.gear_gain * p.maximum_force / p.inertia * m.dt
+    """Replace a speed that hardly a motor gains or loses within a cycle. The last speed goes on, unless the angle says the same as
+    this one; if the last one was wrong, too, the angle tells the speed."""
+    possible = _GAINED * p.maximum_speed
     was_wrong, s.speed_wrong = s.speed_wrong, False
-    if not 0.0 < m.dt <= ONE_CYCLE_S or abs(m.speed - s.speed) <= possible:
+    stuck = s.plausibility.still > 1
+    if stuck or not 0.0 < m.dt <= ONE_CYCLE_S or abs(m.speed - s.speed) <= possible:
         return
     by_angle = (m.angle - s.angle) / m.dt
     if abs(m.speed - by_angle) > possible:
