@@ -43,8 +43,8 @@ _REPEATED = 3
 
 @njit
 def believe_speed(s: Record, p: Record, m: Record) -> None:
-    """Replace a speed that hardly a motor gains or loses within a cycle. The last speed goes on, unless the angle says the same as
-    this one; if the last one was wrong, too, the angle tells the speed."""
+    """Replace a speed that hardly a motor gains or loses within a cycle. The last speed goes on, unless the angle says the
+    same as this one; if the last one was wrong, too, the angle tells the speed."""
     possible = _GAINED * p.maximum_speed
     was_wrong, s.speed_wrong = s.speed_wrong, False
     stuck = s.plausibility.still > 1
@@ -86,6 +86,9 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
         # The speed of a sample that is wrong may be wrong as well.
         moved, sigma = (slip, hypot(_ZERO_RAD, 0.5 * m.dt * (m.speed - s.speed))) if seen else (jump, reach)
     elif seen and abs(slip) > unsure and abs(s.plausibility.apart + slip) > unsure and not repeats:
+        moved, sigma = slip, _ZERO_RAD
+    elif seen and s.away_s < _AWAY_S and abs(s.away + slip) < min(_SURELY * _ZERO_RAD, 0.5 * abs(s.away)):
+        # What has just moved it by little more than counts comes back by little less.
         moved, sigma = slip, _ZERO_RAD
     elif seen:
         moved = _drift(s, m, slip, turned)
