@@ -87,6 +87,19 @@ def test_a_zero_that_comes_back_had_never_moved_if_it_does_so_within_some_messag
     assert estimates["reasons"][back] & r.OUT_OF_RANGE
 
 
+@pytest.mark.parametrize(("begin", "wrong_rad"), [(1289, 0.32), (1312, -0.318)])
+def test_an_angle_that_is_wrong_by_little_more_than_counts_as_a_jump_comes_back_whole(begin, wrong_rad):
+    """While the speed changes its way back is a little less than counts."""
+
+    def change(samples):
+        samples["angle"][begin] += wrong_rad
+
+    estimates, _ = city.changed(change)
+    good, _ = city.changed()
+    moved = estimates["contact_angle"] - good["contact_angle"]
+    assert abs(moved[begin]) > 0.3 and abs(moved[begin + 1]) < 0.01
+
+
 def test_a_speed_that_is_wrong_for_good_is_said_and_covered():
     def change(samples):
         samples["speed"][city.CLAMPING :] = 1000.0
