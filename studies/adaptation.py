@@ -18,14 +18,13 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Entry, Memory, Store
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import CONTACT, engaged, threshold, torque_sigma, watch_closing
 from emb_daemon.offline.score import rmse
 from emb_daemon.pipeline import Pipeline
-from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
 
 
@@ -147,7 +146,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="releases or trainings")
     parser.add_argument("--output", type=Path, default=Path(), metavar="DIR", help="where the picture goes")
     arguments = parser.parse_args()
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     if arguments.what == "alarms":
         result = false_alarms(calibration, arguments.count or 100_000)
     else:

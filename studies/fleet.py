@@ -19,7 +19,7 @@ from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
 import numpy as np
 
-from emb_daemon.calibration.files import calibration_hash, load_calibration
+from emb_daemon.calibration.files import calibration_hash, shipped_calibration
 from emb_daemon.cli.main import main as emb_daemon
 from emb_daemon.fleet import dataset
 from emb_daemon.fleet.cluster import cluster, run
@@ -30,7 +30,6 @@ from emb_daemon.fleet.scores import Scorer
 from emb_daemon.offline import log_of
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.resources import resource
 
 _FIRST_DAY = datetime.datetime(2026, 10, 1, 7, tzinfo=datetime.UTC)
 _BATCHES, _HIDDEN = "ABCDE", 3
@@ -68,7 +67,7 @@ _KINDS: dict[str, tuple[str, bool, dict[str, tuple[float, float]]]] = {
 
 @cache
 def _calibration():
-    return load_calibration(resource("config/calibration.yaml"))
+    return shipped_calibration()
 
 
 def day_drive(rng: np.random.Generator) -> sc.Schedule:

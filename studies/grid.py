@@ -19,7 +19,7 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
@@ -28,7 +28,6 @@ from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import LATCH
-from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, RESULT_ACCEPTED
 from studies import faults, unlisted
 from studies.faults import LEARNED, NOMINAL, Fault, Size, size_of
@@ -195,7 +194,7 @@ def brake_of(stranger: Path | None) -> Brake:
     Raises:
         InputError: the folder holds no calibration, or its name is no seed.
     """
-    own = load_calibration(resource("config/calibration.yaml"))
+    own = shipped_calibration()
     if stranger is None:
         return Brake(own, own, {}, None, Size(), _WHEEL_M)
     identified = load_calibration(stranger / "c.yaml")

@@ -26,7 +26,7 @@ from emb_daemon.adapt import files
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory, Store
 from emb_daemon.adapt.snapshots import Snapshots
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.records import PARAMETERS
@@ -34,7 +34,6 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import commands_of, park, rest
-from emb_daemon.resources import resource
 
 _CORNER = "FL"
 #: A message of a life: what it says, and of which store.
@@ -193,7 +192,7 @@ def main() -> int:
     count, seed = int(sys.argv[1]), int(sys.argv[2])
     logging.disable(logging.WARNING)
     with tempfile.TemporaryDirectory() as folder:
-        result = kills(count, seed, Path(folder), load_calibration(resource("config/calibration.yaml")))
+        result = kills(count, seed, Path(folder), shipped_calibration())
     print(f"seed {seed}: " + ", ".join(f"{number} {name}" for name, number in result.items()))
     return int(any(result[name] for name in ("torn", "lost", "foreign", "snapshots")))
 

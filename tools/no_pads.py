@@ -2,9 +2,8 @@
 
 import msgspec
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.resources import resource
 
 #: Clearance that no motion closes, rad.
 NEVER = 1e4
@@ -21,7 +20,7 @@ def starting_calibration(
     maximum_speed_rad_per_s: float,
 ) -> Calibration:
     """Inertia and Coulomb friction as a datasheet would say, everything else as shipped."""
-    base, replace = load_calibration(resource("config/calibration.yaml")), msgspec.structs.replace
+    base, replace = shipped_calibration(), msgspec.structs.replace
     motor = {
         "torque_constant_Nm_per_A": torque_constant_Nm_per_A,
         "inertia_kg_m2": inertia_kg_m2,

@@ -5,10 +5,17 @@ import json
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.options import CALIBRATION_HELP, LOG_HELP, add_mapping_argument, add_path, check_output, log_reader
+from emb_daemon.cli.options import (
+    CALIBRATION_HELP,
+    LOG_HELP,
+    add_mapping_argument,
+    add_path,
+    check_output,
+    load_chosen,
+    log_reader,
+)
 from emb_daemon.errors import InputError, tell
 from emb_daemon.estimator.status import TABLE
-from emb_daemon.resources import resource
 
 #: Least share of a log's samples for a reason or fact in the summary; tables contain all reasons.
 _LEAST_SHARE = 0.001
@@ -81,10 +88,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _calibration(arguments: argparse.Namespace):
     """The calibration with the pads that are mounted; prints to stderr if it is none of this brake, or of a brake at all."""
-    from emb_daemon.calibration.files import load_calibration
     from emb_daemon.calibration.parameters import moved
 
-    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+    calibration = load_chosen(arguments.calibration)
     if arguments.pad_thickness is not None:
         calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
     if not calibration.contact.is_in_reach:

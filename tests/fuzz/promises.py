@@ -16,7 +16,7 @@ from functools import cache
 import numpy as np
 
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.jit import njit
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
@@ -40,7 +40,7 @@ _KEPT = ("time_ns", "cycle", "counter", "source", "force", "sigma", "stiffness_f
 @cache
 def _drive(seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Frames, and the true force of each cycle, N."""
-    plant = np.array([plant_from_calibration(load_calibration(resource("config/calibration.yaml")), 0)])
+    plant = np.array([plant_from_calibration(shipped_calibration(), 0)])
     schedule = city_drive().first(seconds)
     frames, truth = Car(plant, ("FL",), start_ns=_START_NS).run(commands_of(schedule, ("FL",)), schedule.drives)
     return frames, truth["force"][:, 0]
