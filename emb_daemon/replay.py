@@ -92,8 +92,7 @@ class Replay:
             learned.
         read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
         start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation always begins
-        with the
-            log, because otherwise the contact angle would be unknown.
+            with the log, because otherwise the contact angle would be unknown.
 
     Attributes:
         corners: those that are estimated; for ``all`` known from the first log on.

@@ -33,8 +33,9 @@ class Master:
     """The other side of XCP on UDP, as far as acquisition needs it.
 
     Attributes:
-        packets: data packets by ODT number; ``gaps`` packets that the counter says were sent besides, ``overloads`` events.
-        spans: by ODT number, first and last time stamp, µs, unwrapped, and the longest step.
+        packets: number of data packets by ODT number.
+        stamps: their time stamps by ODT number, µs, modulo 2^32.
+        gaps, overloads: packets that are missing by the packet counter; overload events of the server.
     """
 
     def __init__(self, port: int):

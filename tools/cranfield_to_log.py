@@ -41,7 +41,6 @@ from emb_daemon.logs.resample import Series, fill_missing, frames_of
 LEAD_M = 5e-3
 GEAR_GAIN_M_PER_RAD = LEAD_M / (2.0 * np.pi)
 NEWTON_PER_KGF = 9.80665
-LOADS_KGF = (-40, 20, 40)
 #: What a first guess says: torque per ampere of supply, N m/A; Coulomb friction, N m; of screw and rotor, kg m2.
 NOMINAL_CONSTANT, NOMINAL_COULOMB, NOMINAL_INERTIA = 1.5, 0.7, 3e-5
 #: Supply current of the drive while the nut stands, A: the middle of the normal runs'.
