@@ -134,7 +134,7 @@ def test_temperatures_of_a_second_log_are_judged_at_its_own_times(rig):
     shift = second.estimates["time_ns"][0] - first.estimates["time_ns"][0]
     assert shift > 0 and np.array_equal(first.time_ns, second.time_ns)
     expected = temperature_figures(second.estimates["time_ns"], second.estimates, second.reference)
-    assert second.figures()["temperature_K"] == expected
+    assert second.figures["temperature_K"] == expected
     assert expected["disc"]["samples"] > 900
 
 
