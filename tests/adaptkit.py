@@ -58,10 +58,10 @@ class ClosedLoop:
         corners: that the car has and the daemon estimates.
     """
 
-    def __init__(self, state: Path, calibration=None, pads_mm: float = 9.5, seed: int = 1, corners=("FL",)):
+    def __init__(self, state: Path, calibration=None, pads_mm: float = 9.5, corners=("FL",)):
         self.calibration, self.corners = calibration or shipped(), corners
         plant = plant_from_calibration(self.calibration, pad_thickness_mm=pads_mm)
-        self.car = Car(np.repeat(np.atleast_1d(plant), len(corners)), corners, seed)
+        self.car = Car(np.repeat(np.atleast_1d(plant), len(corners)), corners, 1)
         calibrations = dict.fromkeys(corners, self.calibration)
         self.adaptation = Adaptation(calibrations, Memory(state), int)
         self.parameters = np.zeros(4, PARAMETERS)

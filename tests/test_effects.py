@@ -224,14 +224,14 @@ def force(p, samples):
     return estimate(samples, p)["stiffness_force"]
 
 
-def _turned(late_s, speed_late_s=0.0, samples=2500):
+def _turned(late_s, speed_late_s=0.0):
     """SAMPLE rows of a motor that turns to and fro, its angle and speed late, with noise and an offset of the speed."""
-    rng, time = np.random.default_rng(3), 0.004 * np.arange(samples)
-    rows = np.zeros(samples, SAMPLE)
+    rng, time = np.random.default_rng(3), 0.004 * np.arange(2500)
+    rows = np.zeros(len(time), SAMPLE)
     rows["dt"][1:] = 0.004
     way = lambda t: 12.0 * np.sin(3.0 * t) ** 3  # noqa: E731
     rows["angle"] = way(time - late_s)
-    rows["speed"] = np.gradient(way(time - speed_late_s), 0.004) + 0.3 * rng.standard_normal(samples) + 0.1
+    rows["speed"] = np.gradient(way(time - speed_late_s), 0.004) + 0.3 * rng.standard_normal(len(time)) + 0.1
     return rows
 
 

@@ -40,9 +40,9 @@ def ideal(parameters):
     return without, with_sensor
 
 
-def _measured(force_N, seed=2, gain=1.0, offset_N=0.0, limit_N=LIMIT_N):
+def _measured(force_N, gain=1.0, offset_N=0.0, limit_N=LIMIT_N):
     """What a sensor says, in whole newtons."""
-    noisy = gain * force_N + offset_N + SENSOR.noise_N * np.random.default_rng(seed).standard_normal(len(force_N))
+    noisy = gain * force_N + offset_N + SENSOR.noise_N * np.random.default_rng(2).standard_normal(len(force_N))
     return np.rint(np.clip(noisy, -limit_N, limit_N))
 
 

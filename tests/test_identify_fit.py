@@ -225,9 +225,9 @@ def _one_curve():
     return replace(known, effects={}, stiffness=replace(known.stiffness, curves=(curve,)))
 
 
-def _slow_log(known, *, seconds=20.0, stiffer=1.0, seed=0):
+def _slow_log(known, *, stiffer=1.0, seed=0):
     """A slow clamp whose force is the stiffness path's, from a sensor with 20 N of noise."""
-    truth = foreignkit.truth(foreignkit.slow(seconds=seconds))
+    truth = foreignkit.truth(foreignkit.slow(seconds=20.0))
     time_s, angle, speed = (column[::8] for column in (truth.time_s, truth.angle, truth.speed))
     log = emb_daemon.log_of_arrays(time_s, angle, speed, force_N=0.0 * angle)
     force = stiffer * simulate(log, known, known.pad_thickness_mm, known.contact.clearance_rad)

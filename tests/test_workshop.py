@@ -52,9 +52,9 @@ _SHARED = ("stiffness_force_N", "stiffness_sigma_N", "torque_force_N", "torque_s
 _NOT_SHARED = [0xFFFF] * 4 + [0xFFFFFFFF]
 
 
-def _judge(memory, reasons, times=3, corner=FL, mode=DEGRADED, frame=_FRAME, now_s=0.0):
+def _judge(memory, reasons, times=3, corner=FL, mode=DEGRADED, frame=_FRAME):
     for _ in range(times):
-        memory.judge(corner, mode, reasons, frame, now_s)
+        memory.judge(corner, mode, reasons, frame, 0.0)
     return [memory.entries[code_of(corner, bit)] for bit in range(len(REASONS))]
 
 
