@@ -27,7 +27,7 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import Unavailable
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
 from emb_daemon.estimator.status import TABLE, names
-from emb_daemon.monitor.listener import Listener
+from emb_daemon.monitor.listener import broadcast_ids
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.live import LiveCar
@@ -264,7 +264,7 @@ class _Served:
     def __init__(self, channel: str, state: Path):
         from emb_daemon.workshop.serve import Diagnostics
 
-        self.bus = open_bus("virtual", channel, [*Listener().ids, 0x710])
+        self.bus = open_bus("virtual", channel, [*broadcast_ids(), 0x710])
         self.daemon = open_bus("virtual", channel, [])
         self.diagnostics = Diagnostics(self.bus, _CONFIGURATION, state, 0x710, 0x718, state / "estimates")
         self._stop, self._counter = threading.Event(), 0

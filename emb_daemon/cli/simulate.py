@@ -63,13 +63,13 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _open_bus(arguments: argparse.Namespace, corners: tuple[str, ...]):
+    from emb_daemon.monitor.listener import broadcast_ids
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.wire.keys import load_keys
-    from emb_daemon.wire.layout import default_layout
     from emb_daemon.wire.secoc import load_links
 
     # The daemon's broadcasts, although the car itself reacts to EMB_c_AdaptRequest only.
-    ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
+    ids = broadcast_ids()
     sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
     ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
     if arguments.mapping:

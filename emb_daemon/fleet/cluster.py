@@ -8,6 +8,7 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from emb_daemon.errors import InputError, Unavailable
@@ -131,15 +132,10 @@ def run(
     results: list = [None] * len(items)
     suspects: list[int] = []
     done = 0
-    waiting = iter(enumerate(items))
-    row_of: dict = {}
 
-    def submit() -> Any:
-        for row, item in waiting:
-            future = client.submit(task, item, pure=False)
-            row_of[future.key] = row
-            return future
-        return None
+    def submit(rows: Iterable[int]) -> dict[Any, int]:
+        """Rows by the futures of their tasks."""
+        return {client.submit(task, items[row], pure=False): row for row in rows}
 
     def settle(row: int, future: Any, final: tuple[type[Exception], ...]) -> None:
         nonlocal done
@@ -160,16 +156,15 @@ def run(
         progress(done, len(items))
 
     ahead = _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    running = {future for future in (submit() for _ in range(min(ahead, len(items)))) if future}
+    waiting = iter(range(len(items)))
+    running = submit(islice(waiting, ahead))
     while running:
         for future in _first_done(client, running):
-            running.remove(future)
-            settle(row_of.pop(future.key), future, (InputError,))
-            if (following := submit()) is not None:
-                running.add(following)
+            settle(running.pop(future), future, (InputError,))
+            running |= submit(islice(waiting, 1))
     # Dask blames a worker's death on every task that was there. Each is repeated alone to find the one that kills a worker.
     for row in suspects:
-        future = client.submit(task, items[row], pure=False)
-        _first_done(client, [future])
-        settle(row, future, (InputError, KilledWorker))
+        alone = submit([row])
+        for future in _first_done(client, alone):
+            settle(row, future, (InputError, KilledWorker))
     return results
