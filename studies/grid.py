@@ -27,9 +27,9 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.records import LATCH
-from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, RESULT_ACCEPTED
+from emb_daemon.wire.contract import CYCLE_S, RESULT_ACCEPTED
 from studies import faults, unlisted
+from studies.drives import park_on_latch
 from studies.faults import LEARNED, NOMINAL, Fault, Size, size_of
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
 from studies.strangers import draw_stranger
@@ -62,14 +62,6 @@ def _reversals(seconds: float, low_N: float, high_N: float) -> sc.Schedule:
     return schedule
 
 
-def _park_on_latch(force_N: float) -> sc.Schedule:
-    """Parked, then held by the latch without current, then released."""
-    clamp = sc.park(force_N, 6.0).first(4.8)
-    hold = sc.rest(10.0)
-    hold.commands["mode"], hold.drives["park_brake"] = LATCH, PARK_APPLIED
-    return clamp + hold + sc.rest(1.0)
-
-
 def draw_drive(
     plant: np.void, rng: np.random.Generator, latched_N: float = 0.0, share: float = 1.0
 ) -> tuple[sc.Schedule, dict[str, float]]:
@@ -85,7 +77,7 @@ def draw_drive(
     # Half of the drives begin on a car that stood parked overnight: training on cold pads comes first.
     cold = (("park_0", sc.park(force(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
     parts = (
-        ("stand", _park_on_latch(latched_N) if latched_N else sc.rest(2.0)),
+        ("stand", park_on_latch(latched_N) if latched_N else sc.rest(2.0)),
         *cold,
         ("hold_1", sc.stop(force(6e3, 11e3), 3.0)),
         ("go_1", sc.accelerate(between(12.0, 16.0), 4.0)),
