@@ -227,7 +227,8 @@ def forged(name: str, genuine: np.ndarray, rng: np.random.Generator, keys) -> np
 
 
 def believed(genuine: np.ndarray, foreign: np.ndarray, keys) -> tuple[np.ndarray, int, int]:
-    """What `Verifier` gives of both together; how many frames of ``genuine`` are missing, and how many others are taken."""
+    """Frames that `Verifier` passes on of both together; number of ``genuine`` frames that are missing, and of others that are
+    accepted."""
     mixed = np.concatenate([foreign, genuine])
     heard = Verifier(_RECEIVED, keys, {}).verify(mixed[np.argsort(mixed["time_ns"], kind="stable")])
     taken, expected = heard[heard["flags"] == 0], genuine[_of_drive(genuine)]

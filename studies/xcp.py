@@ -30,7 +30,7 @@ _NAMES = [signal.name for signal in INPUTS + OUTPUTS]
 
 
 class Master:
-    """The other side of XCP on UDP, as far as acquisition needs it.
+    """A measurement tool on UDP, as far as acquisition needs one.
 
     Attributes:
         packets: number of data packets by ODT number.
@@ -60,7 +60,7 @@ class Master:
                 return response
 
     def hear(self) -> bytes:
-        """Take a datagram; the response in it, if there is one."""
+        """Take a datagram; returns the response in it, empty if there is none."""
         datagram, response = self._socket.recv(65536), b""
         while datagram:
             length, counter = struct.unpack_from("<HH", datagram)

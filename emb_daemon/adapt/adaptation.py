@@ -1,8 +1,8 @@
 """The part of adaptation that is not done in a tick: evaluation, memory, words for the log.
 
-In the daemon a helper thread does this, without real-time priority, and while it computes without the interpreter's lock. In a
-replay it is done at once. In both the result takes effect at the same sample. Only the loop accesses the values in use: the
-helper thread gets copies and returns its results.
+In the daemon a helper thread does this; it has no real-time priority, and releases the interpreter's lock while it computes.
+In a replay it is done at once. In both the result takes effect at the same sample. Only the loop accesses the values in use:
+the helper thread gets copies and returns its results.
 """
 
 import contextlib

@@ -80,7 +80,7 @@ class Refused(Exception):
 
 
 def source_digest(package: Path) -> str:
-    """Of all sources in ``package`` that compiled code can depend on."""
+    """Digest of all sources in ``package`` that compiled code can depend on."""
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
@@ -139,7 +139,7 @@ def find() -> Path | None:
 
 
 def seal(elf: bytes, layouts: dict[str, bytes], **manifest: str | tuple[str, ...]) -> bytes:
-    """A library's bytes."""
+    """Bytes of a library's file: the ELF object, and the `Manifest` of these ``layouts`` and further fields."""
     return elf + b"\n" + msgspec.json.encode(Manifest(sha256=_sha256(elf, layouts), layouts=layouts, **manifest))
 
 

@@ -21,8 +21,8 @@ class Hook:
             are in SI units.
         path: ``stiffness``, ``torque`` or ``thermal``.
         channel: residual in which a change of the quantity shows.
-        like: base parameter (key of the calibration) that changes the same quantity, or None: its regressor times a signal is
-            what any function of that signal would do here.
+        like: base parameter (key of the calibration) that changes the same quantity, or None. The regressor of a function of
+            a signal at this hook is that of the parameter, times the function.
     """
 
     unit: str

@@ -257,8 +257,8 @@ class _Study:
         ageing: list[Finding] = []
         for name in self.covariates[1:]:
             slopes, uneven, own = self.read(name)
-            # The season of a cause that acts by temperature would be the curvature of its law, for which a misfit of the
-            # model's heat passes. It is alike in all units: more of them are only surer of it, and no batch shows it.
+            # The season of a cause that acts by a temperature would be the curvature of its law, and a misfit of the heat
+            # model looks like it. It is the same in all units: more of them only make it more significant; no batch shows it.
             thermal = [row for row, cause in enumerate(self.causes) if cause.thermal and name == "warmth"]
             shared = shared_causes(slopes, {ALL: self.masks[ALL]}, own, beside=False, misfits=thermal)
             shared += shared_causes(slopes, self.groups, own, beside=True)

@@ -19,7 +19,7 @@ from emb_daemon.fleet.scores import Score
 
 #: Directions whose information is below this share of the strongest one's are dominated by rounding and curvature.
 _TOLD_APART = 1e-5
-#: Share of a slope's information that free levels must leave: of what no cause explains, a slope then takes at most double.
+#: Least share of a slope's information that is left where levels are free too: the error of the slope then at most doubles.
 _SLOPE = 0.25
 #: Information, as a share of the drives', with which a direction is drawn to zero.
 _HELD = 0.01
