@@ -17,7 +17,7 @@ from emb_daemon.adapt.learned import (
 )
 from emb_daemon.adapt.memory import Memory, entry_of, with_entry
 from emb_daemon.adapt.records import ACCEPTED
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
 from emb_daemon.pipeline import Pipeline
@@ -29,7 +29,7 @@ from emb_daemon.plant.scenarios import commands_of, park, rest
 ROOT = Path(__file__).parent.parent
 
 
-_SHIPPED = load_calibration(ROOT / "config" / "calibration.yaml")
+_SHIPPED = shipped_calibration()
 
 
 def shipped(**changes):

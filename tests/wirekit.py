@@ -43,6 +43,12 @@ def decode(frame_record) -> tuple[str, dict]:
     return found.name, found.decode(data, decode_choices=False)
 
 
+def merged(*parts: np.ndarray) -> np.ndarray:
+    """Frames of all parts in order of time; of equal times, in the order of the parts."""
+    frames = np.concatenate(parts)
+    return frames[np.argsort(frames["time_ns"], kind="stable")]
+
+
 def same(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two arrays of records hold the same bits, but for those between fields."""
     return all(a[name].tobytes() == b[name].tobytes() for name in a.dtype.names)
