@@ -169,7 +169,7 @@ class _Kernel(CPUDispatcher):
 
     @property
     def _numba_type_(self):
-        """What compiled code that names this function calls."""
+        """The function that compiled code calls where it names this one."""
         return types.Dispatcher(self._within)
 
 

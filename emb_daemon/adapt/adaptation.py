@@ -81,7 +81,7 @@ class Adaptation:
                 self._resumable[CORNERS.index(name)] = snapshot, time_ns
 
     def read(self, corner: str, calibration: Calibration) -> Store:
-        """What is stored for a corner with this calibration. May take long; changes nothing in use."""
+        """A corner's store for this calibration (`Memory.load`). May take long; changes nothing in use."""
         store, warning = self._memory.load(corner, calibration)
         if warning:
             log.warning("corner %s: %s", corner, warning)

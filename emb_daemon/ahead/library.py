@@ -61,11 +61,11 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Description of a library, stored in it."""
 
     format: int = _FORMAT
-    #: Of the ELF object before this line, followed by the layouts.
+    #: Digest of the ELF object before this line, followed by the layouts.
     sha256: str
-    #: `source_digest` of what it was made from.
+    #: `source_digest` of the package that it was made from.
     sources: str
-    #: As uname says it; the CPU that it was compiled for, and the flags of /proc/cpuinfo that this takes.
+    #: Machine by uname; the CPU that it was compiled for, and the flags of /proc/cpuinfo that this takes.
     machine: str
     cpu: str
     flags: tuple[str, ...]
@@ -272,8 +272,8 @@ def _size(kind) -> int:
 
 
 def _address(array: np.ndarray) -> int:
-    """Of an array's first element: what ``array.ctypes.data`` says, in a fifth of its time. It is the first field after the
-    head that every object of CPython has."""
+    """Address of an array's first element: ``array.ctypes.data``, in a fifth of its time. It is the first field after the head
+    that every object of CPython has."""
     return ctypes.c_void_p.from_address(id(array) + object.__basicsize__).value or 0
 
 

@@ -27,7 +27,7 @@ class Part(JITCodeLibrary):
 
     @classmethod
     def of_bitcode(cls, codegen: object, name: str, bitcode: bytes) -> "Part":
-        """What `serialize_using_bitcode` gave."""
+        """The part that `serialize_using_bitcode` wrote."""
         part = cls(codegen, name)
         part._final_module = parse_bitcode(bitcode)
         part._finalize_final_module()

@@ -214,7 +214,7 @@ class _Study:
         if slopes and np.isfinite(warmth).all() and np.ptp(warmth) >= _LEAST_K:
             self.covariates.append("warmth")
         columns = [self._columns(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
-        #: By covariate, the directions in which units may differ.
+        #: The directions in which units may differ, by covariate.
         self.free = [np.eye(self.directions.basis.shape[1])]
         self.free += [changing(self.scores, self.directions, slope) for slope in zip(*(c.T[1:] for c in columns), strict=True)]
         self.units = [unit_of(s, self.directions, c, self.free) for s, c in zip(self.scores, columns, strict=True)]
@@ -223,7 +223,7 @@ class _Study:
         self.levels = {"corner": np.array([corner for _, corner in self.keys])}
         self.levels |= {name: np.array([factors.get(unit, {}).get(name, "") for unit, _ in self.keys]) for name in named}
         self.levels = {name: levels for name, levels in self.levels.items() if len(set(levels.tolist())) > 1}
-        # Of all factors except the corner, whose difference is by design.
+        # Groups of all factors except the corner, whose difference is by design.
         self.groups = {
             f"{name} {level}": levels == level
             for name, levels in self.levels.items() if name != "corner"

@@ -99,7 +99,7 @@ def changing(units: Sequence[Sequence[Score]], directions: Directions, covariate
         both = np.einsum("d,dab->ab", own, information)
         left = left + np.einsum("d,dab->ab", own**2, information) - both @ np.linalg.solve(level, both)
         square += float(own @ own)
-    # Of an average drive the information is one in each direction.
+    # The basis is scaled: an average drive's information is one in each direction.
     share, vectors = np.linalg.eigh(left / square)
     return vectors[:, share >= _SLOPE]
 
@@ -375,7 +375,8 @@ class RandomEffects:
 
 
 def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
-    """Of units' values with their own standard deviations, shape (N,), by Paule and Mandel (J. Research NBS 87, 1982)."""
+    """Mean and spread of units whose values, shape (N,), have standard deviations of their own, by Paule and Mandel (J.
+    Research NBS 87, 1982)."""
     from scipy.optimize import brentq
 
     def excess(share: float) -> float:

@@ -85,7 +85,7 @@ class Pacer:
 
 @entry(Array(ESTIMATE), int, Array(STATE), Array(RECEPTION), Array(np.int64), Array(np.int64), Array(np.int64), returns=3)
 def _scan(estimates, count, states, receptions, arrivals, reported, facts):
-    """What the loop needs to know of new estimates. Sets ``arrivals`` to the time at which each corner's sample was complete
+    """Scan new estimates for the loop. Sets ``arrivals`` to the time at which each corner's sample was complete
     (0: none), ``reported`` to mode and reasons, and ``facts`` to what the estimator found. Returns bit masks of corners:
     estimated; with a state that is not a number; with changed mode or reasons."""
     estimated, lost, changed = 0, 0, 0
