@@ -49,7 +49,7 @@ _WHEEL_M, _STRANGERS_WHEEL_M = 0.31, 0.42
 _SHORTEST_S = 1.0
 #: Time that learning has before the drive's second half, s, for its promises to be asked for.
 _LEARNING_S = 10.0
-#: Of these, two at once have no common drive.
+#: Ways in which a drive begins: of two of them at once there is no common drive.
 _STARTS = {"start_clamped", "start_latched", "power_cycle", "daemon_restart", "wheel_phase_restart"}
 
 
@@ -168,8 +168,8 @@ class _Daemon:
 
 
 class Brake(NamedTuple):
-    """What is driven: the daemon's calibration, the brake's own, effects and unit (None: another for each drive), size, and
-    radius of the wheels, m."""
+    """A brake that is driven: the daemon's calibration, the brake's own, effects and unit (None: another for each drive),
+    size, and radius of the wheels, m."""
 
     calibration: Calibration
     own: Calibration

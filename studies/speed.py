@@ -35,7 +35,7 @@ _SECONDS = 120.0
 _ONE_BY_ONE = 20_000
 #: Number of samples for plain Python.
 _PLAIN = 2000
-#: Of the comparison of kernels; length of each, s.
+#: Rounds of the comparison of kernels, and length of each, s.
 _ROUNDS, _ROUND_S = 5, 4.0
 
 

@@ -113,7 +113,7 @@ def draw_stranger(seed: int) -> Stranger:
 
 
 def plan(stranger: Stranger, seed: int, rng: np.random.Generator) -> None:
-    """What a rig records of the brake."""
+    """Give the stranger the schedules that a rig records, by log, with the thickness of the mounted pads, mm."""
     calibration = stranger.calibration
     high = calibration.stiffness.maximum_force_N
     for thickness in _THICKNESSES_MM:

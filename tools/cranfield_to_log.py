@@ -38,7 +38,7 @@ from emb_daemon.logs.resample import Series, fill_missing, frames_of
 LEAD_M = 5e-3
 GEAR_GAIN_M_PER_RAD = LEAD_M / (2.0 * np.pi)
 NEWTON_PER_KGF = 9.80665
-#: What a first guess says: torque per ampere of supply, N m/A; Coulomb friction, N m; of screw and rotor, kg m2.
+#: A first guess: torque per ampere of supply, N m/A; Coulomb friction, N m; of screw and rotor, kg m2.
 NOMINAL_CONSTANT, NOMINAL_COULOMB, NOMINAL_INERTIA = 1.5, 0.7, 3e-5
 #: Supply current of the drive while the nut stands, A: the middle of the normal runs'.
 STANDSTILL_A = 0.36
@@ -100,7 +100,7 @@ def frames(part: dict[str, np.ndarray], load_kgf: int, with_load: bool = True) -
 
 
 def calibration_to_start_from() -> Calibration:
-    """What one would guess."""
+    """The calibration of a first guess."""
     start = starting_calibration(
         "Cranfield",
         torque_constant_Nm_per_A=NOMINAL_CONSTANT,

@@ -30,7 +30,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.logs.mapping import Mapping
 
 GEAR_GAIN_M_PER_RAD = 5e-4
-#: Of rotor and coupling, kg m2; motor friction, N m: what a datasheet would say.
+#: As a datasheet would give them: inertia of rotor and coupling, kg m2; motor friction, N m.
 NOMINAL_INERTIA, NOMINAL_COULOMB = 1e-4, 0.02
 
 MAPPING = """# Columns of the EMBiR dynamometer.
@@ -46,7 +46,7 @@ signals:
 
 
 def read_header(path: Path) -> tuple[float, str]:
-    """What a run states of itself: the first motor's torque constant, N m/A, and the torque sensor's column.
+    """Values that a run's header states: the first motor's torque constant, N m/A, and the torque sensor's column.
 
     Raises:
         InputError: not a run with both.

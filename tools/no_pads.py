@@ -1,5 +1,5 @@
-"""What the converters of drives that clamp nothing have in common: their command line, and the calibration to start from, the
-thesis's torque balance without other effects."""
+"""Common parts of the converters of drives that clamp nothing: their command line, and the calibration to start from, which is
+the thesis's torque balance without other effects."""
 
 import argparse
 import sys
