@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.answer import answer
@@ -26,7 +26,6 @@ from emb_daemon.logs.stamps import LATEST_S, in_time
 from emb_daemon.logs.write import reference_columns, table_columns
 from emb_daemon.offline import Log, corner_index, estimate, log_of
 from emb_daemon.offline import load_log as load_log
-from emb_daemon.resources import resource
 from emb_daemon.wire import contract
 
 _NAN = float("nan")
@@ -50,11 +49,6 @@ class Answer(NamedTuple):
     outer_mean_C: float
     reasons: tuple[str, ...]
     facts: tuple[str, ...]
-
-
-def shipped_calibration() -> Calibration:
-    """The calibration that ships with the package: that of a simulated rig, for first experiments."""
-    return load_calibration(resource("config/calibration.yaml"))
 
 
 def run(log: Log, calibration: Calibration | str | Path | None = None) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a user sees on standard error: one line that says where and what was expected."""
+"""Errors that a user sees on standard error: one line that says where and what was expected."""
 
 import sys
 
@@ -8,7 +8,7 @@ class InputError(Exception):
 
     @property
     def faults(self) -> list[str]:
-        """What is wrong, one line each."""
+        """The faults, one line each."""
         return str(self).splitlines()
 
 

@@ -138,7 +138,7 @@ class _PartsOnDisk(_OnDisk):
 
 
 class _WithinCache(FunctionCache):
-    """Keeps code for kernels apart from code for Python, of which numba's index would give one for the other."""
+    """Keeps code that kernels call apart from code that Python calls, which numba's index would confuse."""
 
     _impl_class = _PartsOnDisk
 
@@ -147,7 +147,7 @@ class _WithinCache(FunctionCache):
 
 
 class _Within(CPUDispatcher):
-    """A function as kernels call it: without what unpacks Python's objects, and without machine code of its own."""
+    """A function as kernels call it: without a wrapper that unpacks Python's objects, and without machine code of its own."""
 
     def __init__(self, function: Function):
         super().__init__(function, targetoptions=_OPTIONS | {"no_cpython_wrapper": True}, pipeline_class=PartCompiler)
@@ -169,7 +169,7 @@ class _Kernel(CPUDispatcher):
 
     @property
     def _numba_type_(self):
-        """What compiled code that names this function calls."""
+        """The function that compiled code calls where it names this one."""
         return types.Dispatcher(self._within)
 
 

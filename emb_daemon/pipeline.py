@@ -38,8 +38,9 @@ _AGREED = 3
 #: Number of cycles of its message after which an input is reported as lost, and the age up to which the models use its last
 #: value: the same number of cycles of the slowest message, the vehicle's status at 100 ms. Pads take minutes to warm.
 _REPORTED_CYCLES, _USABLE_NS = 25, 2_500_000_000
-#: Time for which a refused frame, or a second sender of the daemon's messages, is reported: ten EMB_c_EstimatorStatus.
-_SHOWN_NS = 1_000_000_000
+#: Time for which a refused frame, a second sender of the daemon's messages or a disturbance of bus or loop is reported, ns:
+#: ten EMB_c_EstimatorStatus.
+SHOWN_NS = 1_000_000_000
 
 #: State of a corner between two samples: the resolver sample that waits for its current, and the last one estimated.
 #: ``cycle``: cycles since the first sample; ``announced``: cycles up to the last row; ``predicted``: rows since then;
@@ -106,7 +107,7 @@ class Pipeline:
         self.corners: np.ndarray = np.zeros(4, CORNER)
         self.corners["active"] = [name in corners for name in wire.CORNERS]
         self.corners["pending"] = -1
-        self.corners["second_sender_ns"] = -2 * _SHOWN_NS
+        self.corners["second_sender_ns"] = -2 * SHOWN_NS
         self.samples: np.ndarray = np.zeros(capacity, SAMPLE)
         self.estimates: np.ndarray = np.zeros(capacity, ESTIMATE)
         self.frames: np.ndarray = np.zeros(4 * capacity, FRAME)
@@ -370,16 +371,16 @@ def _head(b, row, index, age):
         if now - b.receptions[slot].time_ns > _REPORTED_CYCLES * b.layout[0].cycle_ns[slot]:
             reasons |= reason
     for slot in (base, base + 1, base + 2, base + 3, wire.WHEEL_SPEED, wire.WHEEL_PULSE, wire.VEHICLE_STATUS):
-        degraded = b.receptions[slot].degraded and now - b.receptions[slot].time_ns < _SHOWN_NS
-        if degraded or now - b.receptions[slot].refused_ns < _SHOWN_NS:
+        degraded = b.receptions[slot].degraded and now - b.receptions[slot].time_ns < SHOWN_NS
+        if degraded or now - b.receptions[slot].refused_ns < SHOWN_NS:
             reasons |= contract.E2E_ERROR
-        if now - b.receptions[slot].range_ns < _SHOWN_NS:
+        if now - b.receptions[slot].range_ns < SHOWN_NS:
             reasons |= contract.OUT_OF_RANGE
-        if now - b.receptions[slot].contested_ns < _SHOWN_NS:
+        if now - b.receptions[slot].contested_ns < SHOWN_NS:
             reasons |= contract.CONTESTED
     if corner.unproven:
         reasons |= contract.E2E_ERROR | contract.CONTESTED
-    if now - corner.second_sender_ns < _SHOWN_NS:
+    if now - corner.second_sender_ns < SHOWN_NS:
         reasons |= contract.SECOND_SENDER
     row.reasons = reasons
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +45,6 @@ class Result:
     reference: References
     force_N: np.ndarray
 
-    def reasons(self) -> dict[str, float]:
-        """Share of the samples with each reason, the most frequent first."""
-        return _shares(self.estimates["reasons"], REASONS)
-
-    def facts(self) -> dict[str, float]:
-        """The same of what the estimator found, by the names of `estimator.status.TABLE`."""
-        return _shares(self.estimates["facts"], TABLE)
-
     def since(self, time_ns: int) -> "Result":
         """The part from ``time_ns`` on the log's clock on. Raises InputError: there is none."""
         rows = self.time_ns >= time_ns
@@ -60,15 +53,17 @@ class Result:
         names = ("time_ns", "estimates", "samples", "force_N")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
+    @cached_property
     def figures(self) -> dict[str, Any]:
-        """Error figures against the log's reference instruments, if it has any."""
+        """Shares of the samples with each reason and fact (`estimator.status.TABLE`), and error figures against the log's
+        reference instruments, if it has any."""
         return {
             "log": str(self.path),
             "corner": CORNERS[self.samples["corner"][0]],
             "samples": len(self.estimates),
             "seconds": 1e-9 * float(self.time_ns[-1] - self.time_ns[0]),
-            "reasons": self.reasons(),
-            "facts": self.facts(),
+            "reasons": _shares(self.estimates["reasons"], REASONS),
+            "facts": _shares(self.estimates["facts"], TABLE),
             "invalid": float(np.mean(self.estimates["source"] == INVALID)),
             "force_N": force_figures(self.samples, self.estimates, self.force_N),
             "temperature_K": temperature_figures(self.estimates["time_ns"], self.estimates, self.reference),
@@ -92,8 +87,7 @@ class Replay:
             learned.
         read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
         start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation always begins
-        with the
-            log, because otherwise the contact angle would be unknown.
+            with the log, because otherwise the contact angle would be unknown.
 
     Attributes:
         corners: those that are estimated; for ``all`` known from the first log on.

@@ -18,14 +18,14 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Entry, Memory, Store
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.estimator.records import PARAMETERS
+from emb_daemon.estimator.records import PARAMETERS, new_state
 from emb_daemon.jit import njit
 from emb_daemon.models.contact import CONTACT, engaged, threshold, torque_sigma, watch_closing
+from emb_daemon.offline import estimate
+from emb_daemon.offline.log import samples_in
 from emb_daemon.offline.score import rmse
-from emb_daemon.pipeline import Pipeline
-from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
 
 
@@ -60,17 +60,21 @@ def _false_alarms(state, releases, p, contact_sigma, rng):
     return alarms, samples
 
 
-def false_alarms(calibration: Calibration, releases: int = 100_000) -> dict:
+def false_alarms(calibration: Calibration, releases: int) -> dict:
     """False engagements in the clearance, with a contact angle known to 0.1 rad; simulated."""
     p = to_parameters(calibration)
     alarms, samples = _false_alarms(np.zeros(1, CONTACT)[0], releases, p, 0.1, np.random.default_rng(1))
     return {"releases": releases, "samples": int(samples), "false_alarms": int(alarms)}
 
 
-def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear_mm: float = 9.0, seed: int = 1) -> dict:
-    """Force error of a brake whose pads wear by ``wear_mm`` over ``cycles`` park cycles, with adaptation and without.
+#: Park cycles of a brake's life, and what its pads wear by in it.
+_CYCLES, _WEAR_MM = 1000, 9.0
 
-    Training motion is driven in every ``cycles / trainings``-th cycle, and the force is judged on random motor angles (thesis
+
+def wear(calibration: Calibration, trainings: int) -> dict:
+    """Force error of a brake whose pads wear by 9 mm over 1000 park cycles, with adaptation and without.
+
+    ``trainings`` cycles, evenly spread, have training motion, and the force is judged on random motor angles (thesis
     3.3.2) afterwards, in the state of wear then reached; the cycles between only wear the pads. The daemon is restarted each
     time, so that learned values come from its memory. The clearance stays the same, because the actuator follows wear.
     Simulated car, whose brake shares no force model with the estimator.
@@ -84,25 +88,20 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(trainings + 1):
-            mounted = thickness - wear_mm * number / trainings
+            mounted = thickness - _WEAR_MM * number / trainings
             plant = plant_from_calibration(calibration, pad_thickness_mm=mounted)
-            rng = np.random.default_rng(seed + number)
+            rng = np.random.default_rng(1 + number)
             schedule = training(plant, high_N=18000.0) + random_angle(plant, 10.0, rng)
-            car = Car(np.atleast_1d(plant), ("FL",), seed + number)
+            car = Car(np.atleast_1d(plant), ("FL",), 1 + number)
             frames, truth = car.run(commands_of(schedule, ("FL",)), schedule.drives)
-            row = {"cycle": number * cycles // trainings, "pads_mm": mounted}
+            samples, _ = samples_in(frames, ("FL",))
+            row = {"cycle": number * _CYCLES // trainings, "pads_mm": mounted}
             for name, state in (("with", Path(folder)), ("without", None)):
-                parameters = np.zeros(4, PARAMETERS)
-                parameters[0] = to_parameters(calibration)
                 learner = Adaptation({"FL": calibration}, Memory(state), int) if state else None
-                pipeline = Pipeline(parameters, ("FL",), capacity=1 << 14, adaptation=learner)
-                pipeline.begin(0)
-                estimates, start = [], 0
-                while start < len(frames):
-                    start, count = pipeline.collect(frames, start, predictions=False)
-                    pipeline.answer(count)
-                    estimates.append(pipeline.estimates[:count].copy())
-                estimates = np.concatenate(estimates)
+                parameters = np.full(4, to_parameters(calibration), PARAMETERS)
+                if learner:
+                    learner.restore(parameters)
+                estimates = estimate(samples, parameters, new_state(4), learner)
                 judged = round(10.0 / CYCLE_S)
                 error = estimates["force"][-judged:] - truth["force"][:, 0][-judged:]
                 row[name] = {
@@ -112,7 +111,7 @@ def wear(calibration: Calibration, cycles: int = 1000, trainings: int = 20, wear
                 if learner:
                     row["outcome"] = learner.last_outcome("FL")
             rows.append(row)
-    return {"cycles": cycles, "trainings": trainings, "wear_mm": wear_mm, "rows": rows}
+    return {"cycles": _CYCLES, "trainings": trainings, "wear_mm": _WEAR_MM, "rows": rows}
 
 
 def plot_wear(result: dict, path: Path) -> None:
@@ -147,7 +146,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="releases or trainings")
     parser.add_argument("--output", type=Path, default=Path(), metavar="DIR", help="where the picture goes")
     arguments = parser.parse_args()
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     if arguments.what == "alarms":
         result = false_alarms(calibration, arguments.count or 100_000)
     else:

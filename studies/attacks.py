@@ -20,7 +20,7 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.jit import njit
 from emb_daemon.pipeline import Pipeline
@@ -73,7 +73,7 @@ def _taken(frames, strange, receptions, layout):
 
 def drive(seconds: float, seed: int) -> np.ndarray:
     """Frames of one corner in the city."""
-    plant = np.array([plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed)])
+    plant = np.array([plant_from_calibration(shipped_calibration(), seed)])
     schedule = city_drive().first(seconds)
     return Car(plant, ("FL",), start_ns=_START_NS).run(commands_of(schedule, ("FL",)), schedule.drives)[0]
 
@@ -227,7 +227,8 @@ def forged(name: str, genuine: np.ndarray, rng: np.random.Generator, keys) -> np
 
 
 def believed(genuine: np.ndarray, foreign: np.ndarray, keys) -> tuple[np.ndarray, int, int]:
-    """What `Verifier` gives of both together; how many frames of ``genuine`` are missing, and how many others are taken."""
+    """Frames that `Verifier` passes on of both together; number of ``genuine`` frames that are missing, and of others that are
+    accepted."""
     mixed = np.concatenate([foreign, genuine])
     heard = Verifier(_RECEIVED, keys, {}).verify(mixed[np.argsort(mixed["time_ns"], kind="stable")])
     taken, expected = heard[heard["flags"] == 0], genuine[_of_drive(genuine)]
@@ -261,7 +262,7 @@ def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
 def _cost(seed: int) -> None:
     """Median time of a tick of four corners, µs: of what the daemon hears and of what it sends; on the CPU, independent of
     other processes."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     plants = np.array([plant_from_calibration(calibration, seed + k) for k in range(4)])
     schedule = city_drive().first(20.0)
     frames = Car(plants, CORNERS, start_ns=_START_NS).run(commands_of(schedule, CORNERS), schedule.drives)[0]

@@ -1,8 +1,9 @@
-"""Schedules of a rig's operator: a training, a stop and a long brake application."""
+"""Schedules of a rig's operator: a training, parking on the latch, a stop and a long brake application."""
 
 import numpy as np
 
-from emb_daemon.plant.scenarios import Schedule, angle_at, clamp, move, rest
+from emb_daemon.plant.records import LATCH
+from emb_daemon.plant.scenarios import Schedule, angle_at, clamp, move, park, rest
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED
 
 
@@ -22,6 +23,13 @@ def training(plant: np.void, seconds: float = 42.0, high_N: float = 15000.0) -> 
     angle += 0.8 * np.sin(2.0 * np.pi * 6.0 * time)
     schedule.drives["park_brake"] = PARK_APPLIED
     return move(schedule, _approach(angle)) + rest(0.5)
+
+
+def park_on_latch(force_N: float) -> Schedule:
+    """Parked, then held by the latch without current, then released."""
+    hold = rest(10.0)
+    hold.commands["mode"], hold.drives["park_brake"] = LATCH, PARK_APPLIED
+    return park(force_N, 6.0).first(4.8) + hold + rest(1.0)
 
 
 def rig_stop(force_N: float, wheel_speed: float, clamp_seconds: float = 3.0, cycle_seconds: float = 9.0) -> Schedule:

@@ -19,7 +19,7 @@ from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
 import numpy as np
 
-from emb_daemon.calibration.files import calibration_hash, load_calibration
+from emb_daemon.calibration.files import calibration_hash, shipped_calibration
 from emb_daemon.cli.main import main as emb_daemon
 from emb_daemon.fleet import dataset
 from emb_daemon.fleet.cluster import cluster, run
@@ -30,14 +30,13 @@ from emb_daemon.fleet.scores import Scorer
 from emb_daemon.offline import log_of
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.resources import resource
 
 _FIRST_DAY = datetime.datetime(2026, 10, 1, 7, tzinfo=datetime.UTC)
 _BATCHES, _HIDDEN = "ABCDE", 3
 #: RMS in contact (N) of what a batch shares, of a single unit's fault, and of what a month does to everybody's grease.
 _BATCH_N, _FAULT_N, _AGEING_N = (40.0, 80.0), (120.0, 250.0), 40.0
 _FAULTY = 10
-#: What healthy units differ in by 45 N is no fault before it is six times as much.
+#: Parameters in which healthy units differ by 45 N, and the size (N) of a fault in them: six times as much and more.
 _SCATTERING, _SCATTERING_FAULT_N = {"friction.load_m_per_rad", "friction.offset_Nm"}, (270.0, 400.0)
 
 
@@ -50,7 +49,7 @@ class Secret:
     parameters: dict[str, float]
 
 
-#: What a secret may be: where the simulated brake has it, whether its sign is drawn, and shapes with their ranges.
+#: Kinds of secrets, by cause: its parameter in the simulated brake, whether its sign is drawn, and shapes with their ranges.
 _KINDS: dict[str, tuple[str, bool, dict[str, tuple[float, float]]]] = {
     "friction.load_m_per_rad": ("load_friction", True, {}),
     "friction.offset_Nm": ("offset_friction", False, {}),
@@ -68,7 +67,7 @@ _KINDS: dict[str, tuple[str, bool, dict[str, tuple[float, float]]]] = {
 
 @cache
 def _calibration():
-    return load_calibration(resource("config/calibration.yaml"))
+    return shipped_calibration()
 
 
 def day_drive(rng: np.random.Generator) -> sc.Schedule:
@@ -121,7 +120,7 @@ def apply(plant: np.void, secret: Secret, share: float = 1.0) -> None:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Who has what: batch of each unit, secrets of batches and of single units, and what a month does to all."""
+    """Batch of each unit, secrets of batches and of single units, and what a month does to all."""
 
     seed: int
     days: int
@@ -184,7 +183,7 @@ def drive_unit(root: Path, fleet: Fleet, unit: str) -> int:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found of what is there: batches with the right cause, groups accused wrongly, drifts and seasons that nobody
+    """Findings judged by the secrets: batches with the right cause, groups accused wrongly, drifts and seasons that nobody
     hid, faulty units, units accused wrongly, and how many of the faulty ones have the right cause; whether the ageing was."""
 
     batches: int

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.fleet.cluster import cluster, run
 from emb_daemon.fleet.dataset import DIGEST, Drive, read_drive, write_drive
@@ -33,7 +33,6 @@ from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import estimate
 from emb_daemon.offline.log import samples_in
 from emb_daemon.replay import Replay, corners_in
-from emb_daemon.resources import resource
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -192,7 +191,7 @@ def _processor_s() -> float:
 
 
 def main() -> None:
-    path, calibration = Path(sys.argv[1]), load_calibration(resource("config/calibration.yaml"))
+    path, calibration = Path(sys.argv[1]), shipped_calibration()
     workers = int(sys.argv[2]) if len(sys.argv) > 2 else len(os.sched_getaffinity(0))
     print(f"{'stage':<24}µs a sample   × real time")
     times = {}

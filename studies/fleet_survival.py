@@ -25,7 +25,7 @@ from studies.fleet import _calibration, day_drive
 
 _UNITS, _DAYS, _DAMAGED = 8, 5, 0.1
 _DAY_NS = 86_400_000_000_000
-#: What each stage leaves, and which of it counts its progress.
+#: Files of each stage that count its progress.
 _STAGES = {"ingest": ("ingested/*.json",), "replay": ("figures/**/*.json",), "diagnose": ("evidence/**/*.npz",)}
 
 
@@ -56,7 +56,7 @@ def command(stage: str, logs: Path, root: Path) -> list[str]:
 
 
 def disturbed(stage: str, logs: Path, root: Path) -> str:
-    """Run a stage, kill a worker at a third and the client at two thirds; returns what was there then."""
+    """Run a stage, kill a worker at a third and the client at two thirds of its results; returns what was killed when."""
     total = _UNITS if stage == "diagnose" else _UNITS * _DAYS
     process = psutil.Popen(command(stage, logs, root), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     killed = ""

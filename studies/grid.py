@@ -19,7 +19,7 @@ import numpy as np
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
@@ -27,10 +27,9 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.plant.records import LATCH
-from emb_daemon.resources import resource
-from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, RESULT_ACCEPTED
+from emb_daemon.wire.contract import CYCLE_S, RESULT_ACCEPTED
 from studies import faults, unlisted
+from studies.drives import park_on_latch
 from studies.faults import LEARNED, NOMINAL, Fault, Size, size_of
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
 from studies.strangers import draw_stranger
@@ -50,7 +49,7 @@ _WHEEL_M, _STRANGERS_WHEEL_M = 0.31, 0.42
 _SHORTEST_S = 1.0
 #: Time that learning has before the drive's second half, s, for its promises to be asked for.
 _LEARNING_S = 10.0
-#: Of these, two at once have no common drive.
+#: Ways in which a drive begins: of two of them at once there is no common drive.
 _STARTS = {"start_clamped", "start_latched", "power_cycle", "daemon_restart", "wheel_phase_restart"}
 
 
@@ -61,14 +60,6 @@ def _reversals(seconds: float, low_N: float, high_N: float) -> sc.Schedule:
     swing = 0.5 * (high_N - low_N) * np.sin(2.0 * np.pi * 1.6 * CYCLE_S * np.arange(len(schedule)))
     target += np.where(target > low_N, swing, 0.0)
     return schedule
-
-
-def _park_on_latch(force_N: float) -> sc.Schedule:
-    """Parked, then held by the latch without current, then released."""
-    clamp = sc.park(force_N, 6.0).first(4.8)
-    hold = sc.rest(10.0)
-    hold.commands["mode"], hold.drives["park_brake"] = LATCH, PARK_APPLIED
-    return clamp + hold + sc.rest(1.0)
 
 
 def draw_drive(
@@ -86,7 +77,7 @@ def draw_drive(
     # Half of the drives begin on a car that stood parked overnight: training on cold pads comes first.
     cold = (("park_0", sc.park(force(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
     parts = (
-        ("stand", _park_on_latch(latched_N) if latched_N else sc.rest(2.0)),
+        ("stand", park_on_latch(latched_N) if latched_N else sc.rest(2.0)),
         *cold,
         ("hold_1", sc.stop(force(6e3, 11e3), 3.0)),
         ("go_1", sc.accelerate(between(12.0, 16.0), 4.0)),
@@ -177,8 +168,8 @@ class _Daemon:
 
 
 class Brake(NamedTuple):
-    """What is driven: the daemon's calibration, the brake's own, effects and unit (None: another for each drive), size, and
-    radius of the wheels, m."""
+    """A brake that is driven: the daemon's calibration, the brake's own, effects and unit (None: another for each drive),
+    size, and radius of the wheels, m."""
 
     calibration: Calibration
     own: Calibration
@@ -195,7 +186,7 @@ def brake_of(stranger: Path | None) -> Brake:
     Raises:
         InputError: the folder holds no calibration, or its name is no seed.
     """
-    own = load_calibration(resource("config/calibration.yaml"))
+    own = shipped_calibration()
     if stranger is None:
         return Brake(own, own, {}, None, Size(), _WHEEL_M)
     identified = load_calibration(stranger / "c.yaml")

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.logs.read import read_frames
 from emb_daemon.offline import load_log
-from emb_daemon.resources import resource
 from studies.faults import size_of
 from studies.phases import first_flag_s, judge
 
@@ -60,7 +59,7 @@ def judge_injected(
     ``run(frames)`` returns times since the log's first frame (s), ESTIMATE rows and reference force (N)."""
     log = load_log(path)
     rng = np.random.default_rng([seed, number, zlib.crc32(name.encode())])
-    size = size_of(calibration, load_calibration(resource("config/calibration.yaml")))
+    size = size_of(calibration, shipped_calibration())
     frames = read_frames(path)
     moments = _draw_moments(1e-9 * (log.time_ns - frames["time_ns"][0]), log.force_N, rng)
     fault = family(rng, moments, size)

@@ -131,7 +131,7 @@ def main() -> int:
         c = _compiled(Path(folder))
         count = ctypes.c_long(_CALLS)
         pairs = {
-            "Kalman update, 14 states": (lambda s: _update(*s, _CALLS), lambda s: c.update(*place(*s), count)),
+            f"Kalman update, {STATES} states": (lambda s: _update(*s, _CALLS), lambda s: c.update(*place(*s), count)),
             "characteristic curve": (lambda _: _curve(xs, a, _CALLS), lambda _: c.curve(*place(xs, a), len(a), count)),
             "CRC of a frame": (lambda _: _crc(data, _CALLS), lambda _: c.crc(*place(table, data), count)),
         }

@@ -26,7 +26,7 @@ from emb_daemon.adapt import files
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory, Store
 from emb_daemon.adapt.snapshots import Snapshots
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.records import PARAMETERS
@@ -34,26 +34,25 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import commands_of, park, rest
-from emb_daemon.resources import resource
 
 _CORNER = "FL"
-#: A message of a life: what it says, and of which store.
+#: A life's messages: "about to keep" and "kept", each followed by the store's digest; length of a message in bytes.
 _ABOUT, _KEPT, _TELLS = b"A", b"K", 33
-#: A parked car is asked and gives its training within this time, s.
+#: Time in which a parked car is asked for training and gives it, s.
 _PARKED_S = 60.0
-#: Between one life and the next, ns: what may have heated a brake unseen has left it.
+#: Time between one life and the next, ns: long enough for a brake to have cooled, whatever heated it unseen.
 _NIGHT_NS = 8 * 3600 * 1_000_000_000
-#: Of the time that a write takes, how much may go by before the kill.
+#: Latest moment of the kill after a write has begun, as a multiple of the time that a write takes.
 _WRITING = 1.5
 
 
 def digest(store: Store | None) -> bytes:
-    """Of what a file holds."""
+    """Digest of a store's file."""
     return hashlib.sha256(files.encode(store) if store else b"").digest()
 
 
 class TellingMemory(Memory):
-    """Says on a pipe what it is about to keep, and that it has."""
+    """Writes to a pipe before and after it keeps a store."""
 
     def __init__(self, folder: Path, pipe: int):
         super().__init__(folder)
@@ -66,9 +65,10 @@ class TellingMemory(Memory):
 
 
 def live(memory: Memory, calibration: Calibration, pads_mm: float, night: int = 0) -> None:
-    """A parked car whose brake is asked for training after so many nights, gives it, and hears what came of it.
+    """Run a parked car, ``night`` nights after the first, until the daemon has asked for training and told its result.
 
-    What the daemon's helper thread evaluates and writes is done between two ticks: a life that outruns time gives it none.
+    Evaluation and writing are done between two ticks, not by a helper thread, which would get no time in a simulation that
+    runs faster than real time.
     """
     plant = plant_from_calibration(calibration, pad_thickness_mm=pads_mm)
     car = Car(np.atleast_1d(plant), (_CORNER,), 1)
@@ -90,7 +90,7 @@ def live(memory: Memory, calibration: Calibration, pads_mm: float, night: int = 
 
 @contextmanager
 def _load(processes: int):
-    """So many processes that compute without pause."""
+    """Keep so many processes computing without pause."""
     started = []
     try:
         for _ in range(processes):
@@ -106,7 +106,7 @@ def _load(processes: int):
 
 
 def _heard(pipe: int, seconds: float, until: bytes | None) -> bytes:
-    """What a life has said within so long, or until it says ``until``."""
+    """Messages of a life within ``seconds``, or up to the first that begins with ``until``."""
     said, end = b"", time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0 and select.select([pipe], [], [], left)[0]:
         if not (more := os.read(pipe, _TELLS)):
@@ -118,11 +118,12 @@ def _heard(pipe: int, seconds: float, until: bytes | None) -> bytes:
 
 
 def possible(last: bytes, said: bytes) -> tuple[list[bytes], int]:
-    """What may be found after a life that found ``last`` and ``said`` so much; and how many writes it completed."""
+    """Digests of the stores that may be found after a life that began with ``last`` and ``said`` these messages; and the
+    number of writes that it completed."""
     accepted, kept = [last], 0
     for at in range(0, len(said), _TELLS):
         what, store = said[at : at + 1], said[at + 1 : at + _TELLS]
-        # What is kept is not undone: of earlier ones none may be found.
+        # Once a store is kept, no earlier one may be found.
         accepted = [store] if what == _KEPT else [*accepted, store]
         kept += what == _KEPT
     return accepted, kept
@@ -138,12 +139,12 @@ def kills(count: int, seed: int, folder: Path, calibration: Calibration, load: i
     rng = np.random.default_rng(seed)
     result = dict.fromkeys(("kills", "kept", "interrupted", "torn", "lost", "foreign", "snapshots"), 0)
     memory, last = Memory(folder), digest(None)
-    # Compiled once, in the process that all lives are copies of. On the disk that is meant.
+    # Lives are copies of this process, so that kernels are compiled once. The folder is on the disk that is tested.
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         for _ in range(2):
             begin = time.monotonic()
             live(Memory(Path(scratch)), calibration, 6.0)
-        #: How long a life lasts until it writes, and a write, s.
+        # Time from a life's begin to its write, and of a write, s.
         whole_s = (1 + load) * (time.monotonic() - begin)
         store, begin = Memory(Path(scratch)).read(_CORNER), time.monotonic()
         Memory(Path(scratch)).save(store)
@@ -193,7 +194,7 @@ def main() -> int:
     count, seed = int(sys.argv[1]), int(sys.argv[2])
     logging.disable(logging.WARNING)
     with tempfile.TemporaryDirectory() as folder:
-        result = kills(count, seed, Path(folder), load_calibration(resource("config/calibration.yaml")))
+        result = kills(count, seed, Path(folder), shipped_calibration())
     print(f"seed {seed}: " + ", ".join(f"{number} {name}" for name, number in result.items()))
     return int(any(result[name] for name in ("torn", "lost", "foreign", "snapshots")))
 

@@ -26,15 +26,15 @@ from emb_daemon.resources import shipped_configuration
 from emb_daemon.wire.layout import CORNERS
 from studies.xcp import MEASURED, Master
 
-#: More of the 99 % quantile of a tick than this, µs, is more than asked.
+#: Largest rise of a tick's 99 % quantile that is accepted, µs.
 _ASKED_US = 5.0
 _PORT = 8251
-#: In which a daemon and a simulated car are up, s.
+#: Time in which a daemon and a simulated car have started, s.
 _START_S = 6.0
 
 
 def _stream(stop: threading.Event) -> None:
-    """What a browser with the page open does, and Prometheus."""
+    """Do what a browser with the page open does."""
     page = f"http://127.0.0.1:{_PORT}"
     while not stop.is_set():
         with suppress(OSError), urllib.request.urlopen(f"{page}/events", timeout=2.0) as events:
@@ -44,7 +44,7 @@ def _stream(stop: threading.Event) -> None:
 
 
 def _measure(port: int, share: Path, stop: threading.Event, packets: list[int]) -> None:
-    """What a master does, once the measured daemon is there."""
+    """Do what a measurement tool does, once the measured daemon shares its estimates in ``share``."""
     while not share.exists():
         if stop.wait(0.1):
             return
@@ -61,12 +61,12 @@ def _measure(port: int, share: Path, stop: threading.Event, packets: list[int]) 
 
 @contextmanager
 def _children(*commands: list) -> Iterator[list[subprocess.Popen]]:
-    """``emb-daemon`` with these arguments, until the end."""
+    """Processes of ``emb-daemon`` with these arguments, which end with the context."""
     program, plain = [sys.executable, "-m", "emb_daemon.cli.main"], os.environ | {"NUMBA_DISABLE_JIT": "1"}
     children = []
     try:
         for command in commands:
-            # What only listens needs no kernels.
+            # Processes that only listen need no kernels.
             environment = None if command[0] in ("run", "simulate") else plain
             children.append(subprocess.Popen([*program, *command], stdout=subprocess.PIPE, text=True, env=environment))
         yield children
@@ -79,7 +79,7 @@ def _children(*commands: list) -> Iterator[list[subprocess.Popen]]:
 
 @contextmanager
 def another_car(folder: Path) -> Iterator[list[str]]:
-    """A simulated car and its daemon, neither of them in real time; gives the options of their bus."""
+    """A simulated car and its daemon, neither with real-time priority; yields the options of their bus."""
     bus = ["-i", "udp_multicast", "-c", f"239.74.166.{os.getpid() % 250 + 3}"]
     shipped_configuration(folder, CORNERS, "log_level: error", "realtime: {fifo_priority: null, lock_memory: false}")
     with _children(["simulate", *bus], ["run", "--config", folder / "emb.yaml", *bus]):
@@ -88,7 +88,7 @@ def another_car(folder: Path) -> Iterator[list[str]]:
 
 @contextmanager
 def listeners(folder: Path, share: Path, bus: list[str]) -> Iterator[list[int]]:
-    """All of them; the list gets the number of packets that the measurement got."""
+    """All listeners; yields a list to which the number of measured packets is appended at the end."""
     config, heard, stop, packets = ["--config", folder / "emb.yaml"], folder / "heard.mcap", threading.Event(), []
     with _children(
         ["xcp", *config, "--share", share, "--udp", "127.0.0.1:0"],
@@ -103,7 +103,7 @@ def listeners(folder: Path, share: Path, bus: list[str]) -> Iterator[list[int]]:
         for thread in threads:
             thread.start()
         try:
-            # Imported and at work, all of them.
+            # The recording is the last to begin.
             while not heard.exists() or not heard.stat().st_size:
                 if any(child.poll() is not None for child in children):
                     raise RuntimeError("a listener has ended")
@@ -134,7 +134,6 @@ def main() -> int:
             measure("alone")
             measure("estimates shared", folder / "unread")
             with another_car(folder) as bus:
-                # Not before it has started.
                 time.sleep(_START_S)
                 measure("beside another car")
                 with listeners(folder, folder / "estimates", bus) as packets:

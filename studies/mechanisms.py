@@ -14,9 +14,7 @@ import numpy as np
 from emb_daemon.calibration.types import Calibration, Travel
 from emb_daemon.models.stiffness import travel_at
 from emb_daemon.plant import scenarios as sc
-from emb_daemon.plant.records import LATCH
-from emb_daemon.wire.contract import PARK_APPLIED
-from studies.drives import rig_stop
+from studies.drives import park_on_latch, rig_stop
 from studies.strangers import Stranger, draw_brake, main, plan
 
 #: Points of the brake's own table and of the datasheet's, which are every so many of them.
@@ -53,9 +51,7 @@ def with_travel(calibration: Calibration, slope, rng: np.random.Generator) -> Ca
 def _latched(calibration: Calibration, rng: np.random.Generator) -> sc.Schedule:
     """Parked, held by the latch without current, released, and driven on."""
     high = calibration.stiffness.maximum_force_N
-    hold = sc.rest(10.0)
-    hold.commands["mode"], hold.drives["park_brake"] = LATCH, PARK_APPLIED
-    park = sc.park(high * rng.uniform(0.4, 0.6), 6.0).first(4.8) + hold + sc.rest(2.0)
+    park = park_on_latch(high * rng.uniform(0.4, 0.6)) + sc.rest(1.0)
     return park + rig_stop(0.3 * high, 40.0) + park + sc.rest(1.0)
 
 

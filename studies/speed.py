@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from emb_daemon.bench.loop import machine, measure_loop
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import PARAMETERS
 from emb_daemon.logs.read import read_frames
@@ -35,7 +35,7 @@ _SECONDS = 120.0
 _ONE_BY_ONE = 20_000
 #: Number of samples for plain Python.
 _PLAIN = 2000
-#: Of the comparison of kernels; length of each, s.
+#: Rounds of the comparison of kernels, and length of each, s.
 _ROUNDS, _ROUND_S = 5, 4.0
 
 
@@ -68,7 +68,7 @@ def difference(one: np.ndarray, other: np.ndarray) -> float:
 
 def measure_logs() -> dict[str, Any]:
     """Figures by CPU time over a simulated single-corner log, in the page cache and with kernels compiled."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     frames, _ = simulate_log(plant_from_calibration(calibration, 0), city_drive(), _SECONDS)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.log"

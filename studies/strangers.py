@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.cli.main import main as emb_daemon
 from emb_daemon.identify.example import FILES
@@ -32,7 +32,6 @@ from emb_daemon.offline import estimate, load_log
 from emb_daemon.offline.score import first_known, rmse, share_inside, temperature_figures
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.resources import resource
 from studies.blind import DRAWN, draw, draw_sized
 from studies.drives import rig_drag, rig_stop, training
 
@@ -57,7 +56,7 @@ class Stranger:
 
 def draw_brake(rng: np.random.Generator) -> Calibration:
     """The shipped calibration's brake with another force, screw, motor and friction."""
-    base = load_calibration(resource("config/calibration.yaml"))
+    base = shipped_calibration()
     force = float(np.exp(rng.uniform(np.log(10e3), np.log(45e3)))) / base.stiffness.maximum_force_N
     angle = float(np.exp(rng.uniform(np.log(0.6), np.log(1.8))))
     torque = force / angle
@@ -114,7 +113,7 @@ def draw_stranger(seed: int) -> Stranger:
 
 
 def plan(stranger: Stranger, seed: int, rng: np.random.Generator) -> None:
-    """What a rig records of the brake."""
+    """Give the stranger the schedules that a rig records, by log, with the thickness of the mounted pads, mm."""
     calibration = stranger.calibration
     high = calibration.stiffness.maximum_force_N
     for thickness in _THICKNESSES_MM:

@@ -30,11 +30,12 @@ _NAMES = [signal.name for signal in INPUTS + OUTPUTS]
 
 
 class Master:
-    """The other side of XCP on UDP, as far as acquisition needs it.
+    """A measurement tool on UDP, as far as acquisition needs one.
 
     Attributes:
-        packets: data packets by ODT number; ``gaps`` packets that the counter says were sent besides, ``overloads`` events.
-        spans: by ODT number, first and last time stamp, µs, unwrapped, and the longest step.
+        packets: number of data packets by ODT number.
+        stamps: their time stamps by ODT number, µs, modulo 2^32.
+        gaps, overloads: packets that are missing by the packet counter; overload events of the server.
     """
 
     def __init__(self, port: int):
@@ -59,7 +60,7 @@ class Master:
                 return response
 
     def hear(self) -> bytes:
-        """Take a datagram; the response in it, if there is one."""
+        """Take a datagram; returns the response in it, empty if there is none."""
         datagram, response = self._socket.recv(65536), b""
         while datagram:
             length, counter = struct.unpack_from("<HH", datagram)

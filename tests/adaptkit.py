@@ -17,7 +17,7 @@ from emb_daemon.adapt.learned import (
 )
 from emb_daemon.adapt.memory import Memory, entry_of, with_entry
 from emb_daemon.adapt.records import ACCEPTED
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS
 from emb_daemon.pipeline import Pipeline
@@ -29,7 +29,7 @@ from emb_daemon.plant.scenarios import commands_of, park, rest
 ROOT = Path(__file__).parent.parent
 
 
-_SHIPPED = load_calibration(ROOT / "config" / "calibration.yaml")
+_SHIPPED = shipped_calibration()
 
 
 def shipped(**changes):
@@ -58,10 +58,10 @@ class ClosedLoop:
         corners: that the car has and the daemon estimates.
     """
 
-    def __init__(self, state: Path, calibration=None, pads_mm: float = 9.5, seed: int = 1, corners=("FL",)):
+    def __init__(self, state: Path, calibration=None, pads_mm: float = 9.5, corners=("FL",)):
         self.calibration, self.corners = calibration or shipped(), corners
         plant = plant_from_calibration(self.calibration, pad_thickness_mm=pads_mm)
-        self.car = Car(np.repeat(np.atleast_1d(plant), len(corners)), corners, seed)
+        self.car = Car(np.repeat(np.atleast_1d(plant), len(corners)), corners, 1)
         calibrations = dict.fromkeys(corners, self.calibration)
         self.adaptation = Adaptation(calibrations, Memory(state), int)
         self.parameters = np.zeros(4, PARAMETERS)

@@ -7,9 +7,7 @@ from scipy.signal import lfilter
 from emb_daemon.estimator.records import SAMPLE
 
 
-def samples(
-    p, angle, dt: float = 0.004, friction=None, temperature: float = 20.0, creep=(0.0, 1.0)
-) -> tuple[np.ndarray, np.ndarray]:
+def samples(p, angle, dt: float = 0.004, friction=None, creep=(0.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
     """SAMPLE rows of a motor that follows ``angle`` (rad past the released position), and the clamp force (N).
 
     The current is what the torque balance asks for, with friction that turns over within the presliding angle, or with the
@@ -29,7 +27,7 @@ def samples(
     rows["dt"], rows["dt"][0] = dt, 0.0
     rows["angle"], rows["speed"], rows["current_q"] = angle, speed, torque / p["torque_constant"]
     for name in ("inner_backplate", "outer_backplate", "caliper", "ambient"):
-        rows[name] = temperature
+        rows[name] = 20.0
     rows["brake_torque"] = np.nan
     for name in ("has_current", "has_thermocouple", "has_wheel_speed", "has_wheel_pulse", "has_status"):
         rows[name] = True

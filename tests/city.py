@@ -4,12 +4,11 @@ import functools
 
 import numpy as np
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, simulate_log
-from emb_daemon.resources import resource
 
 #: Rows: standing released, clamping, holding 7 kN, holding until it is released at `OPENED`; the second clearance.
 RELEASED, CLAMPING, HOLDING, BEFORE_RELEASE, OPENED, SECOND_CLEARANCE = 400, 1300, 1500, 2000, 2150, 2600
@@ -18,7 +17,7 @@ RELEASED, CLAMPING, HOLDING, BEFORE_RELEASE, OPENED, SECOND_CLEARANCE = 400, 130
 @functools.cache
 def drive(seed: int = 0, seconds: float = 15.0) -> tuple[np.ndarray, np.ndarray]:
     """Samples of a simulated unit, and the true clamp force."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     frames, _ = simulate_log(plant_from_calibration(calibration, seed), city_drive(), seconds, seed=seed)
     log = log_of(frames)
     return log.samples, log.force_N
@@ -26,7 +25,7 @@ def drive(seed: int = 0, seconds: float = 15.0) -> tuple[np.ndarray, np.ndarray]
 
 def estimated(samples: np.ndarray) -> np.ndarray:
     """ESTIMATE rows with the shipped calibration."""
-    return estimate(samples, to_parameters(load_calibration(resource("config/calibration.yaml"))))
+    return estimate(samples, to_parameters(shipped_calibration()))
 
 
 def changed(change=lambda samples: None, seed: int = 0, seconds: float = 15.0) -> tuple[np.ndarray, np.ndarray]:

@@ -136,10 +136,9 @@ def shipped_setup():
 @pytest.fixture(scope="session")
 def calibration():
     """The shipped one, of one brake."""
-    from emb_daemon.calibration.files import load_calibration
-    from emb_daemon.resources import resource
+    from emb_daemon.calibration.files import shipped_calibration
 
-    return load_calibration(resource("config/calibration.yaml"))
+    return shipped_calibration()
 
 
 @pytest.fixture

@@ -109,9 +109,9 @@ def truth(angle: np.ndarray | None = None) -> Truth:
     return Truth(rows["angle"], rows["speed"], rows["current_q"], force)
 
 
-def sampled(of: Truth, rate_Hz: float, means: bool = True, seed: int = 1) -> dict[str, np.ndarray]:
+def sampled(of: Truth, rate_Hz: float, means: bool = True) -> dict[str, np.ndarray]:
     """Columns as the rig's instruments give them: current a mean over the sampling period, or instantaneous."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     step = round(1.0 / rate_Hz / FINE_S)
     rows = np.arange(step, len(of.angle), step)
     total = np.concatenate([[0.0], np.cumsum(of.current)])

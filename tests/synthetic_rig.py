@@ -96,9 +96,9 @@ def _slow(travel: float, seconds: float = 24.0) -> np.ndarray:
     return travel * (1.0 - np.cos(4.0 * np.pi * phase)) / 2.0
 
 
-def _random(rng: np.random.Generator, clearance: float, travel: float, seconds: float = 12.0) -> np.ndarray:
-    """New random targets every 100 ms, reached as a second-order motor loop reaches them."""
-    samples, angle, speed = round(seconds / CYCLE_S), 0.0, 0.0
+def _random(rng: np.random.Generator, clearance: float, travel: float) -> np.ndarray:
+    """Twelve seconds of random targets, a new one every 100 ms, reached as a second-order motor loop reaches them."""
+    samples, angle, speed = round(12.0 / CYCLE_S), 0.0, 0.0
     path, target = np.zeros(samples), 0.0
     for row in range(samples):
         if row > 100 and row % 25 == 0:

@@ -323,8 +323,9 @@ def heat(loop, celsius=120.0):
     loop.car.states["softening_memory"] = celsius - loop.calibration.thermal.softening.reference_C
 
 
-def warm(loop, celsius=120.0):
-    """A drive that warmed the pads, as car and estimator know of it."""
+def warm(loop):
+    """A drive that warmed the pads to 120 degC, as car and estimator know of it."""
+    celsius = 120.0
     loop.run(rest(0.5))
     heat(loop, celsius)
     rise = celsius - loop.calibration.thermal.softening.reference_C
@@ -495,8 +496,8 @@ def corrected():
     return fit(trained_rows(to_parameters(IDEAL)), believed())
 
 
-def learned_curve(found, base=IDEAL):
-    return to_parameters(moved(base, found.values))["curve"]
+def learned_curve(found):
+    return to_parameters(moved(IDEAL, found.values))["curve"]
 
 
 def force_error(found, p, travel):

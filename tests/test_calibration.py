@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 
 from emb_daemon.adapt.records import to_limits
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.calibration.files import calibration_hash, dump_calibration, load_calibration, save_calibration
+from emb_daemon.calibration.files import (
+    calibration_hash,
+    dump_calibration,
+    load_calibration,
+    save_calibration,
+    shipped_calibration,
+)
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.types import (
@@ -32,7 +38,7 @@ from emb_daemon.errors import InputError, InputErrors, InvalidValue
 from emb_daemon.resources import resource
 
 _TEXT = resource("config/calibration.yaml").read_text()
-_CALIBRATION = load_calibration(resource("config/calibration.yaml"))
+_CALIBRATION = shipped_calibration()
 
 
 def _line(text: str, key: str) -> int:

@@ -32,12 +32,12 @@ class Judged:
     def __init__(self, seed):
         self.c, self._noise = np.zeros(1, CONSISTENCY), np.random.default_rng(seed)
 
-    def pass_by(self, seconds, bias=0.0, sigma=_SIGMA):
+    def pass_by(self, seconds, bias=0.0):
         """White noise of the stated standard deviation over ``bias`` of them. Returns verdicts (n, horizons) and model
         errors."""
         count = round(seconds / _DT)
         verdicts, errors = np.zeros((count, HORIZONS), np.int64), np.zeros(count)
-        _pass_by(self.c[0], sigma * (self._noise.standard_normal(count) + bias), sigma, _DT, verdicts, errors)
+        _pass_by(self.c[0], _SIGMA * (self._noise.standard_normal(count) + bias), _SIGMA, _DT, verdicts, errors)
         return verdicts, errors
 
 

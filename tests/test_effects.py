@@ -16,7 +16,7 @@ import pytest
 from numba.core import config
 
 import emb_daemon
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.effects import REGISTRY, signal_delay
 from emb_daemon.effects.gear_mesh_ripple import cycle_mean
@@ -25,13 +25,12 @@ from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import simulate_log
-from emb_daemon.resources import resource
 from studies.blind import campaign
 
 DT = 0.004
 
 
-_CALIBRATION = load_calibration(resource("config/calibration.yaml"))
+_CALIBRATION = shipped_calibration()
 
 
 def bare():
@@ -127,14 +126,13 @@ import pickle, sys
 from pathlib import Path
 import numpy as np
 from emb_daemon import offline
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.offline.run import held
-from emb_daemon.resources import resource
 
-calibration, log = load_calibration(resource("config/calibration.yaml")), pickle.loads(Path(sys.argv[1]).read_bytes())
+calibration, log = shipped_calibration(), pickle.loads(Path(sys.argv[1]).read_bytes())
 for widening in (0.0, 0.8):
     own = moved(calibration, {"effects.own_effect.widening_um_per_K": widening}, checked=True)
     error = offline.estimate(log.samples, held(to_parameters(own)))["stiffness_force"] - log.force_N
@@ -226,14 +224,14 @@ def force(p, samples):
     return estimate(samples, p)["stiffness_force"]
 
 
-def _turned(late_s, speed_late_s=0.0, samples=2500):
+def _turned(late_s, speed_late_s=0.0):
     """SAMPLE rows of a motor that turns to and fro, its angle and speed late, with noise and an offset of the speed."""
-    rng, time = np.random.default_rng(3), 0.004 * np.arange(samples)
-    rows = np.zeros(samples, SAMPLE)
+    rng, time = np.random.default_rng(3), 0.004 * np.arange(2500)
+    rows = np.zeros(len(time), SAMPLE)
     rows["dt"][1:] = 0.004
     way = lambda t: 12.0 * np.sin(3.0 * t) ** 3  # noqa: E731
     rows["angle"] = way(time - late_s)
-    rows["speed"] = np.gradient(way(time - speed_late_s), 0.004) + 0.3 * rng.standard_normal(samples) + 0.1
+    rows["speed"] = np.gradient(way(time - speed_late_s), 0.004) + 0.3 * rng.standard_normal(len(time)) + 0.1
     return rows
 
 

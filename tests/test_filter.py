@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.hypotheses import to_force, to_torque
@@ -31,7 +31,6 @@ from emb_daemon.models.fusion import (
     variance_along,
 )
 from emb_daemon.offline import estimate
-from emb_daemon.resources import resource
 from emb_daemon.wire.contract import TORQUE_ONLY
 
 
@@ -286,7 +285,7 @@ def test_contact_angle_is_learned_from_the_torque(parameters):
 def test_what_no_model_of_the_torque_explains_moves_no_force_where_the_calibration_states_it(share):
     """A gear that gives and takes 20 % beyond 3 kN looks to the torque like other pads, as nothing of it is calibrated."""
     samples, force = city.drive(seconds=60.0)
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     motor = calibration.motor
     lost = share * np.maximum(force - 3000.0, 0.0) * motor.gear_gain_m_per_rad / motor.torque_constant_Nm_per_A
     samples = samples.copy()

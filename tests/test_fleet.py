@@ -331,8 +331,9 @@ def test_what_another_estimator_made_is_made_anew(tmp_path, logs, calibration, m
 # -- statistics -------------------------------------------------------------------------------------------------------
 
 
-def _fleet(rng, units=60, size=6, causes=12):
+def _fleet(rng):
     """Units of three batches with scatter that is large in some directions, and prints of causes."""
+    units, size, causes = 60, 6, 12
     spread = np.diag(10.0 ** rng.uniform(-1.0, 0.5, size))
     turn = np.linalg.qr(rng.standard_normal((size, size)))[0]
     values = rng.standard_normal((units, size)) @ spread @ turn
@@ -440,12 +441,12 @@ def test_units_that_differ_by_their_noise_alone_have_no_spread():
     assert found.spread == 0.0
 
 
-def _scores(rng, unit, amounts, count, causes=4, warmth=None):
+def _scores(rng, unit, amounts, count, warmth=None):
     """Synthetic drives of one unit, a day apart: each has information of its own, and ``amounts(drive)`` of the causes with
     noise. One unit of a cause makes 50 N."""
     result = []
     for number in range(count):
-        table = 50.0 * rng.standard_normal((200, causes))
+        table = 50.0 * rng.standard_normal((200, 4))
         residual = table @ amounts(number) + 20.0 * rng.standard_normal(200)
         table = np.column_stack([table, residual])
         drive = dataset.Drive(unit, "FL", "", number * 86_400_000_000_000, f"{number:016x}")

@@ -9,7 +9,7 @@ import wirekit
 from wirekit import MS
 
 import emb_daemon
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import ForceSensor, to_parameters
 from emb_daemon.errors import InputErrors
@@ -35,14 +35,14 @@ def ideal(parameters):
     """A brake of the thesis's models alone, and the same with a sensor."""
     without = brake.ideal(parameters)
     with_sensor = without.copy()
-    mounted = msgspec.structs.replace(load_calibration(resource("config/calibration.yaml")), force_sensor=SENSOR)
+    mounted = msgspec.structs.replace(shipped_calibration(), force_sensor=SENSOR)
     with_sensor["sensor"] = to_parameters(mounted)["sensor"]
     return without, with_sensor
 
 
-def _measured(force_N, seed=2, gain=1.0, offset_N=0.0, limit_N=LIMIT_N):
+def _measured(force_N, gain=1.0, offset_N=0.0, limit_N=LIMIT_N):
     """What a sensor says, in whole newtons."""
-    noisy = gain * force_N + offset_N + SENSOR.noise_N * np.random.default_rng(seed).standard_normal(len(force_N))
+    noisy = gain * force_N + offset_N + SENSOR.noise_N * np.random.default_rng(2).standard_normal(len(force_N))
     return np.rint(np.clip(noisy, -limit_N, limit_N))
 
 
@@ -153,7 +153,7 @@ def test_it_stands_in_where_the_resolver_has_failed(ideal):
 
 
 def _car(force_sensor):
-    calibration = msgspec.structs.replace(load_calibration(resource("config/calibration.yaml")), force_sensor=force_sensor)
+    calibration = msgspec.structs.replace(shipped_calibration(), force_sensor=force_sensor)
     car = Car(np.atleast_1d(plant_from_calibration(calibration, 3)), seed=4)
     schedule = sc.rest(1.0) + sc.stop(8000.0, 2.0) + sc.rest(1.0)
     frames, truth = car.run(sc.commands_of(schedule, ("FL",)), schedule.drives)
@@ -193,9 +193,7 @@ def test_a_car_without_it_sends_what_it_sent():
 
 
 def _sample(frames):
-    pipeline = Pipeline(
-        np.repeat(np.atleast_1d(to_parameters(load_calibration(resource("config/calibration.yaml")))), 4), ("FL",)
-    )
+    pipeline = Pipeline(np.repeat(np.atleast_1d(to_parameters(shipped_calibration())), 4), ("FL",))
     pipeline.begin(0)
     _, count = pipeline.consume(np.concatenate(frames))
     return pipeline.samples[:count]
@@ -252,7 +250,7 @@ def test_a_strangers_sensor_is_mapped(tmp_path):
 
 
 def test_its_section_of_the_calibration_is_checked(tmp_path):
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     text = resource("config/calibration.yaml").read_text()
     (tmp_path / "c.yaml").write_text(text + "force_sensor: {limit_N: -1, noise_N: 10, offset_N: 1, gain_relative: 2}\n")
     with pytest.raises(InputErrors) as faults:

@@ -10,7 +10,7 @@ import pytest
 from scipy.interpolate import pchip_interpolate
 
 import emb_daemon
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.identify import validation
 from emb_daemon.identify.example import FILES
@@ -19,7 +19,6 @@ from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.write import write_frames
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.resources import resource
 from studies.drives import rig_stop
 
 _PAGE = Path(__file__).parent.parent / "docs" / "own_actuator.md"
@@ -184,7 +183,7 @@ def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
 def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeypatch):
     """In slow clamps alone, a gear with play passes for friction that turns over within a radian: 1.7 kN in a stop."""
     effects = {"stribeck_friction": {"rise": 0.25, "speed_rad_per_s": 14.0}, "backlash": {"play_rad": 0.12}}
-    shipped = load_calibration(resource("config/calibration.yaml"))
+    shipped = shipped_calibration()
     plant = plant_from_calibration(shipped, effects=effects)
     drive = sum((rig_stop(force, 40.0, 3.0, 6.0) for force in (4e3, 9e3, 16e3, 6e3)), sc.rest(2.0))
     for seed, (name, schedule) in enumerate({"curve": sc.curve(plant), "fit": drive, "judge": drive}.items()):

@@ -9,7 +9,7 @@ import yaml
 
 from emb_daemon.adapt.fit import fit_training
 from emb_daemon.adapt.records import ACCEPTED, TRAINING
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
 from emb_daemon.calibration.types import Calibration, Travel, to_parameters
 from emb_daemon.errors import InvalidValue
@@ -28,7 +28,6 @@ from emb_daemon.offline import estimate, load_log
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.brake import equivalent_angle, motor_angle
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.resources import resource
 from emb_daemon.wire.contract import CYCLE_S
 from studies.drives import training
 
@@ -45,7 +44,7 @@ def ramp(calibration: Calibration, points: int = 13) -> Calibration:
 
 @pytest.fixture(scope="module")
 def shipped() -> Calibration:
-    return load_calibration(resource("config/calibration.yaml"))
+    return shipped_calibration()
 
 
 def record(calibration: Calibration, path):

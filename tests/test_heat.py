@@ -23,11 +23,11 @@ def _diffusivity(p):
     return p["conductivity"] / (p["density"] * p["specific_heat"])
 
 
-def _march(p, pads, seconds, dt, power=0.0, disc=20.0, backplate=20.0, braking=False, wheel_speed=0.0, ambient=20.0):
-    work = np.empty((4, CHAIN))
+def _march(p, pads, seconds, dt, power=0.0, backplate=20.0, braking=False, wheel_speed=0.0):
+    work, disc = np.empty((4, CHAIN)), 20.0
     for _ in range(round(seconds / dt)):
         disc = heat_step(
-            p, pads, disc, backplate, backplate, ambient, power, braking, wheel_speed, dt, work, LONGEST_S, UNALTERED
+            p, pads, disc, backplate, backplate, 20.0, power, braking, wheel_speed, dt, work, LONGEST_S, UNALTERED
         )
     return disc
 

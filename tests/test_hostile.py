@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 import wirekit
 from fuzz import promises
-from test_pipeline import _run, _sliding, car  # noqa: F401
+from test_pipeline import _log, _run, car  # noqa: F401
 from wirekit import MS
 
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.memory import Memory
-from emb_daemon.calibration.configuration import Setup
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.records import new_state
 from emb_daemon.logs.read import read_frames
-from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import FRAME
@@ -27,23 +26,14 @@ from studies import attacks
 _CYCLES = 400
 
 
-def _good(cycles=_CYCLES):
-    return np.concatenate(_sliding(cycles))
-
-
-def _merged(*parts):
-    frames = np.concatenate(parts)
-    return frames[np.argsort(frames["time_ns"], kind="stable")]
-
-
 @pytest.fixture(scope="module")
 def undisturbed(car):  # noqa: F811
-    return _run(car, _merged(_good()))[0]
+    return _run(car, _log(_CYCLES))[0]
 
 
 def _undisturbed_by(car, foreign, undisturbed, detected=r.E2E_ERROR):  # noqa: F811
     """Run with ``foreign`` among the frames; every sample's numbers must be the same to the bit. Returns the estimates."""
-    estimates, _ = _run(car, _merged(_good(), *foreign))
+    estimates, _ = _run(car, wirekit.merged(_log(_CYCLES), *foreign))
     assert np.all(estimates["is_sample"]) and len(estimates) == len(undisturbed)
     for name in ("cycle", "counter", "force", "sigma", "stiffness_force", "torque_force", "contact_angle", "disc", "mean"):
         assert estimates[name].tobytes() == undisturbed[name].tobytes(), name
@@ -75,7 +65,7 @@ def test_who_contradicts_a_sender_at_the_right_time_makes_the_force_a_fault(car,
     said, until a second after the last."""
     signals = {"MotorAngle": 99.0} if "Resolver" in message else {"CurrentQ": 30.0}
     forged = [wirekit.frame(message, c * CYCLE_NS - round(ahead_ms * MS), c % 15, **signals) for c in range(150, 170)]
-    estimates, sent = _run(car, _merged(_good(500), *forged))
+    estimates, sent = _run(car, wirekit.merged(_log(500), *forged))
     contested = (estimates["cycle"] > 151) & (estimates["cycle"] < 170 + 240)
     assert np.all(estimates["mode"][contested] == r.FAULT) and np.all(estimates["reasons"][contested] & r.E2E_ERROR)
     assert np.all(estimates["mode"][estimates["cycle"] > 170 + 255] != r.FAULT)
@@ -89,13 +79,13 @@ def test_who_contradicts_a_sender_at_the_right_time_makes_the_force_a_fault(car,
 @pytest.mark.parametrize("can_id", [0x120, 0x180, 0x181, 0x182])
 def test_who_contradicts_any_other_input_makes_it_a_fault_too(car, can_id):  # noqa: F811
     """A forged vehicle status says that a clamped brake is released, of which a filter that starts anew would begin."""
-    frames = _merged(_good(700))
+    frames = _log(700)
     own = (frames["can_id"] == can_id) & (frames["time_ns"] > 150 * CYCLE_NS) & (frames["time_ns"] < 230 * CYCLE_NS)
     forged = frames[own].copy()
     forged["data"] ^= np.uint64(1 << 16)
     forged["time_ns"] -= MS
     attacks._protect_anew(forged)
-    estimates, _ = _run(car, _merged(frames, forged))
+    estimates, _ = _run(car, wirekit.merged(frames, forged))
     first, last = forged["time_ns"][[0, -1]]
     contested = (estimates["time_ns"] > first + 2 * CYCLE_NS) & (estimates["time_ns"] < last + 995 * MS)
     assert len(forged) >= 3 and np.all(estimates["mode"][contested] == r.FAULT)
@@ -109,14 +99,14 @@ def test_what_was_learned_from_two_senders_is_forgotten(learns, tmp_path):
     is estimated as after a start."""
 
     def estimated(frames, folder):
-        calibrations = {"FL": Setup(resource("config/emb.yaml")).calibrations["FL"]}
+        calibrations = {"FL": shipped_calibration()}
         return attacks.estimated(frames, Adaptation(calibrations, Memory(folder), int) if learns else None)
 
     for name in ("good", "bad"):
         (tmp_path / name).mkdir()
     frames = attacks.drive(48.0, 1)
     forged = attacks.played_back(frames, 3.0)
-    good, bad = estimated(frames, tmp_path / "good"), estimated(_merged(frames, forged), tmp_path / "bad")
+    good, bad = estimated(frames, tmp_path / "good"), estimated(wirekit.merged(frames, forged), tmp_path / "bad")
     after = bad[(bad["mode"] != r.FAULT) & (bad["time_ns"] > forged["time_ns"][-1])]
     off = np.abs(after["force"] - np.interp(after["time_ns"], good["time_ns"], good["force"]))
     assert len(after) > 1500 and np.all(off < 3.0 * after["sigma"])
@@ -124,7 +114,7 @@ def test_what_was_learned_from_two_senders_is_forgotten(learns, tmp_path):
 
 
 def test_nothing_is_kept_of_a_brake_with_two_senders():
-    calibration = Setup(resource("config/emb.yaml")).calibrations["FL"]
+    calibration = shipped_calibration()
     state, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
     state["started"] = True
     assert restart.take_snapshot(state, to_parameters(calibration), snapshot)
@@ -134,7 +124,7 @@ def test_nothing_is_kept_of_a_brake_with_two_senders():
 
 def test_a_frame_that_comes_twice_contradicts_nobody(car, undisturbed):  # noqa: F811
     """A gateway repeats what it hears: refused, and no doubt about the first."""
-    again = _merged(_good())
+    again = _log(_CYCLES)
     again = again[np.isin(again["can_id"], [0x100, 0x110]) & (again["time_ns"] > _KNOWN.start * CYCLE_NS)].copy()
     again["time_ns"] += MS // 2
     estimates = _undisturbed_by(car, [again], undisturbed)
@@ -156,7 +146,7 @@ def test_second_sender_of_an_input(car, undisturbed, delay_ms):  # noqa: F811
 
 def test_replayed_stretch(car, undisturbed):  # noqa: F811
     """Half a second of all fast messages, recorded and sent again a second later between the genuine ones."""
-    frames = _merged(_good())
+    frames = _log(_CYCLES)
     fast = frames[np.isin(frames["can_id"], [0x100, 0x110])]
     old = fast[(fast["time_ns"] >= 100 * CYCLE_NS) & (fast["time_ns"] < 220 * CYCLE_NS)].copy()
     for shift in (7, 11):
@@ -198,7 +188,7 @@ def test_second_sender_of_our_own_messages(car, undisturbed):  # noqa: F811
 @pytest.mark.parametrize("first", [0, 200])
 def test_a_sender_that_was_held_up_may_catch_up(first):
     """A bus that was busy for 60 ms delivers in a burst what waited: late is not early, all are taken."""
-    receptions, frames = new_reception(), _merged(_good())
+    receptions, frames = new_reception(), _log(_CYCLES)
     frames = frames[frames["can_id"] == 0x100]
     held = (frames["time_ns"] >= first * CYCLE_NS) & (frames["time_ns"] < (first + 15) * CYCLE_NS)
     frames["time_ns"][held] = (first + 15) * CYCLE_NS - MS

@@ -326,9 +326,9 @@ def test_mixture_is_the_law_of_total_variance(p, clamped):
     assert s["alternatives"]["share"] == pytest.approx([*weights[1:], drift])
 
 
-def _grown(s, h, warmth=60.0):
-    """What ``warmth`` K of the disc add to the standard deviation of the force, N."""
-    return np.sqrt(mix(s, h, 40.0, warmth)[1] ** 2 - mix(s, h, 40.0, 0.0)[1] ** 2)
+def _grown(s, h):
+    """What 60 K of the disc add to the standard deviation of the force, N."""
+    return np.sqrt(mix(s, h, 40.0, 60.0)[1] ** 2 - mix(s, h, 40.0, 0.0)[1] ** 2)
 
 
 def test_a_disc_that_grows_unseen_counts_as_long_as_nothing_has_shown_its_growth(p, clamped):
@@ -754,12 +754,12 @@ def test_a_torque_far_off_or_not_trusted_teaches_nothing(sigmas, trusted, learns
     np.testing.assert_allclose(P, expected[1], atol=1e-9)
 
 
-def _placed(p, x, contact, scale, growth, warmth, sigma=0.0, factor=0.9, force=5000.0):
+def _placed(p, x, contact, scale, growth, warmth, sigma=0.0, force=5000.0):
     s = new_state()[0]
     s["past_contact"], s["force"] = x, force
     a = s["alternatives"][STIFFNESS_JUMP]
     a["error"][[CONTACT, SCALE, GROWTH]], a["covariance"][CONTACT, CONTACT] = (contact, scale, growth), sigma**2
-    place(s, a, p, factor, warmth)
+    place(s, a, p, 0.9, warmth)
     return a
 
 

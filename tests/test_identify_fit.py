@@ -13,7 +13,7 @@ from synthetic_rig import datasheet, draw, pads
 
 import emb_daemon
 from emb_daemon.calibration.curves import Curve, curve_at, rising_force
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, TORQUE_CONSTANT, moved, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import to_parameters
@@ -46,7 +46,6 @@ from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import rest, simulate_log
-from emb_daemon.resources import resource
 from studies.drives import rig_stop
 
 
@@ -226,9 +225,9 @@ def _one_curve():
     return replace(known, effects={}, stiffness=replace(known.stiffness, curves=(curve,)))
 
 
-def _slow_log(known, *, seconds=20.0, stiffer=1.0, seed=0):
+def _slow_log(known, *, stiffer=1.0, seed=0):
     """A slow clamp whose force is the stiffness path's, from a sensor with 20 N of noise."""
-    truth = foreignkit.truth(foreignkit.slow(seconds=seconds))
+    truth = foreignkit.truth(foreignkit.slow(seconds=20.0))
     time_s, angle, speed = (column[::8] for column in (truth.time_s, truth.angle, truth.speed))
     log = emb_daemon.log_of_arrays(time_s, angle, speed, force_N=0.0 * angle)
     force = stiffer * simulate(log, known, known.pad_thickness_mm, known.contact.clearance_rad)
@@ -380,7 +379,7 @@ def test_torque_that_is_off_by_another_share_in_each_manoeuvre_lasts(share, foun
 
 def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current(monkeypatch):
     """Its signal is there in the whole step alone: by the force paths of cold pads the term would do nothing."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     hidden = {"size": 0.2, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 1.0, "other": -1.0}
 
     def drive(effects):
@@ -415,7 +414,7 @@ def test_what_a_term_over_temperature_does_to_cold_pads_is_no_error_of_a_fold():
         name="term:stiffness:surface_temperature", port="stiffness", signal="surface_temperature", shape="decay",
         coefficient=-0.2, scale=600.0, low=20.0, high=300.0,
     )  # fmt: skip
-    known = replace(load_calibration(resource("config/calibration.yaml")), terms=(term,))
+    known = replace(shipped_calibration(), terms=(term,))
     log = log_of(simulate_log(plant_from_calibration(known, seed=3), rest(1.0) + rig_stop(15e3, 1.0), seed=3)[0])
     force = run_step(log.samples, held(to_parameters(known)))["force"]
     log = dataclasses.replace(log, force_N=force)
@@ -435,7 +434,7 @@ def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
 @pytest.mark.parametrize(("share", "searched"), [(0.3, False), (0.8, True)])
 def test_without_random_motion_a_campaign_is_searched_where_it_clamps_fast(monkeypatch, share, searched):
     """Slow motion leaves lag and inertia to the datasheet, and what a search makes of them is none of the brake's."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     speed = share * calibration.motor.maximum_speed_rad_per_s * np.array([0.0, 1.0, 1.5])
     drive = SimpleNamespace(samples={"speed": speed}, force_N=np.array([0.0, 5e3, 0.0]))
     without_random = SimpleNamespace(pads=[], fit=SimpleNamespace(curves=[]))

@@ -220,9 +220,9 @@ def test_a_cold_log_is_named_with_what_was_needed():
         check_excitation(r)
 
 
-def _friction_recording(law, truth, seconds=600.0):
+def _friction_recording(law, truth):
     """Braking at changing force and speed whose torque follows ``law`` (force N, speed rad/s, surface degC)."""
-    t = STEP_S * np.arange(round(seconds / STEP_S))
+    t = STEP_S * np.arange(round(600.0 / STEP_S))
     force = 2500.0 + 1500.0 * np.sign(np.sin(2.0 * np.pi * t / 37.0))
     speed = 18.0 + 14.0 * np.sign(np.sin(2.0 * np.pi * t / 101.0))
     touching = np.ones(len(t), bool)

@@ -33,7 +33,7 @@ _DT = 0.004
 _COUNT = 2.0 * np.pi / 4096
 
 
-def _strokes(seconds=3.0):
+def _strokes():
     """Angle (rad) and speed (rad/s) at any time (s): strokes of a tenth of a second and more."""
     return (lambda t: 10.0 * (1.0 - np.cos(9.0 * t)) * (t > 0.0)), (lambda t: 90.0 * np.sin(9.0 * t) * (t > 0.0))
 

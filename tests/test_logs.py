@@ -45,10 +45,10 @@ _messages = st.builds(
 )
 
 
-def _matches(frames, messages, tolerance_ns=2000):
+def _matches(frames, messages):
     assert len(frames) == len(messages)
     for frame, message in zip(frames, messages, strict=True):
-        assert abs(int(frame["time_ns"]) - message.timestamp * 1e9) <= tolerance_ns
+        assert abs(int(frame["time_ns"]) - message.timestamp * 1e9) <= 2000
         assert frame["can_id"] == message.arbitration_id
         assert bool(frame["flags"] & EXTENDED) == message.is_extended_id
         assert bool(frame["flags"] & REMOTE) == message.is_remote_frame

@@ -42,11 +42,10 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def p():
-    from emb_daemon.calibration.files import load_calibration
+    from emb_daemon.calibration.files import shipped_calibration
     from emb_daemon.calibration.types import to_parameters
-    from emb_daemon.resources import resource
 
-    return brake.ideal([to_parameters(load_calibration(resource("config/calibration.yaml")))])
+    return brake.ideal([to_parameters(shipped_calibration())])
 
 
 @given(

@@ -18,7 +18,7 @@ import wirekit
 
 from emb_daemon.cli.main import main
 from emb_daemon.estimator.status import BEYOND_RANGE, DISC_UNEVEN, sentences
-from emb_daemon.monitor.listener import SECOND_NS, Listener
+from emb_daemon.monitor.listener import SECOND_NS, Listener, broadcast_ids
 from emb_daemon.monitor.metrics import exposition
 from emb_daemon.monitor.web import Datagrams, Web, hand_out
 from emb_daemon.runtime.bus import open_bus
@@ -132,7 +132,7 @@ def test_a_taken_port_is_told(web, capsys):
 @contextlib.contextmanager
 def _live(receivers, channel, corners=CORNERS, shared=None):
     """A daemon's broadcasts on a bus inside the process, handed out."""
-    bus, daemon, stop = open_bus("virtual", channel, Listener().ids), open_bus("virtual", channel, []), threading.Event()
+    bus, daemon, stop = open_bus("virtual", channel, broadcast_ids()), open_bus("virtual", channel, []), threading.Event()
 
     def broadcast():
         counter = 0

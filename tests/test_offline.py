@@ -10,14 +10,13 @@ import pytest
 from synthetic_rig import draw, pads
 
 import emb_daemon
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE
 from emb_daemon.offline import estimate
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 from emb_daemon.offline.run import held, run_paths, run_step, stiffness_force
 from emb_daemon.offline.score import EpisodeErrors, figures, force_figures, rmse, share_inside
-from emb_daemon.resources import resource
 from emb_daemon.wire import contract
 
 
@@ -26,7 +25,7 @@ def random_motion():
     """Samples of a random motor angle, and the shipped calibration's record."""
     rng = np.random.default_rng(7)
     samples = pads(draw(rng), rng)[0].logs[1].samples
-    return samples, np.array([to_parameters(load_calibration(resource("config/calibration.yaml")))])
+    return samples, np.array([to_parameters(shipped_calibration())])
 
 
 def test_paths_alone_and_the_whole_step_start_alike_and_give_the_same_forces(random_motion):

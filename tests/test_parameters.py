@@ -10,16 +10,15 @@ from hypothesis import strategies as st
 
 from emb_daemon.adapt.records import to_limits
 from emb_daemon.calibration import parameters
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.parameters import in_words, keys, moved, parameter, value_of
 from emb_daemon.calibration.types import AdaptationLimits, Calibration, ForceSensor, to_parameters
 from emb_daemon.effects import REGISTRY
 from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.resources import resource
 
 #: With every optional section.
 _CALIBRATION = msgspec.structs.replace(
-    load_calibration(resource("config/calibration.yaml")),
+    shipped_calibration(),
     force_sensor=ForceSensor(
         limit_N=5e3, noise_N=10.0, offset_N=50.0, offset_walk_N_per_sqrt_s=1.0, offset_N_per_K=1.0, gain_relative=0.01
     ),

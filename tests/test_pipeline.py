@@ -45,8 +45,7 @@ def _parameters():
 
 @functools.cache
 def _log(cycles=260):
-    frames = np.concatenate(_sliding(cycles))
-    return frames[np.argsort(frames["time_ns"], kind="stable")]
+    return wirekit.merged(*_sliding(cycles))
 
 
 def _run(parameters, frames, corners=("FL",), begin_ns=0, end_ns=None, cuts=(), capacity=4096):
@@ -106,8 +105,7 @@ def test_jitter_of_arrival_does_not_reach_the_payloads(car, undisturbed, seed):
     frames["time_ns"][fast] += np.repeat(rng.integers(-MS, MS, fast.sum() // 2), 2)
     frames["time_ns"][frames["can_id"] == 0x110] += rng.integers(-MS // 2, MS, fast.sum() // 2)
     frames["time_ns"][~fast] -= 2 * MS
-    frames = frames[np.argsort(frames["time_ns"], kind="stable")]
-    _, sent = _run(car, frames, begin_ns=-5 * MS)
+    _, sent = _run(car, wirekit.merged(frames), begin_ns=-5 * MS)
     assert np.array_equal(sent["can_id"], undisturbed[1]["can_id"])
     assert np.array_equal(sent["data"], undisturbed[1]["data"])
 
@@ -140,12 +138,9 @@ def test_broadcast_is_what_the_contract_says(undisturbed):
 
 def test_four_corners_are_independent(car, undisturbed):
     """The same brake at all corners gives each the estimates of one alone; one that is silent disturbs none."""
-    frames = [frame for corner in ("FL", "FR", "RR") for frame in _sliding(150, corner=corner)
-              if corner == "FL" or frame["can_id"][0] not in (0x180, 0x181, 0x182)]  # fmt: skip
-    frames = np.concatenate(frames)
-    speed = np.isin(frames["can_id"], [0x180])
-    frames = frames[~speed]
-    frames = frames[np.argsort(frames["time_ns"], kind="stable")]
+    frames = wirekit.merged(*(frame for corner in ("FL", "FR", "RR") for frame in _sliding(150, corner=corner)
+                              if corner == "FL" or frame["can_id"][0] not in (0x180, 0x181, 0x182)))  # fmt: skip
+    frames = frames[frames["can_id"] != 0x180]
     estimates, sent = _run(car, frames, corners=("FL", "FR", "RL", "RR"))
     samples = estimates[estimates["is_sample"]]
     alone = samples[samples["corner"] == 0]
@@ -278,13 +273,13 @@ def test_logs_at_a_reduced_rate(car, every):
     [(0x120, "has_thermocouple"), (0x180, "has_wheel_speed"), (0x181, "has_wheel_pulse"), (0x182, "has_status")],
 )
 def test_a_slow_input_feeds_the_models_for_two_and_a_half_seconds_after_its_last_frame(car, can_id, flag):
-    frames = np.concatenate(
-        [frame for frame in _sliding(800) if frame["can_id"][0] != can_id or frame["time_ns"][0] < 100 * MS]
+    frames = wirekit.merged(
+        *(frame for frame in _sliding(800) if frame["can_id"][0] != can_id or frame["time_ns"][0] < 100 * MS)
     )
     last_ns = frames["time_ns"][frames["can_id"] == can_id][-1]
     pipeline = Pipeline(car, ("FL",))
     pipeline.begin(0)
-    _, count = pipeline.collect(frames[np.argsort(frames["time_ns"], kind="stable")])
+    _, count = pipeline.collect(frames)
     age = pipeline.samples["time_ns"][:count] - last_ns
     fed = pipeline.samples[flag][:count]
     assert np.all(fed[(age >= 0) & (age < 2500 * MS)]) and not np.any(fed[age >= 2500 * MS]) and age[-1] > 3000 * MS

@@ -87,11 +87,11 @@ def same(a, b):
     return len(a) == len(b) and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a.dtype.names)
 
 
-def settled(car, mode, target, seconds, drive=None):
+def settled(car, mode, target, seconds):
     standing = scenarios.rest(CYCLE_S)
     standing.commands["mode"], standing.commands["target"] = mode, target
     for _ in range(round(seconds / CYCLE_S)):
-        car.tick(standing.commands, standing.drives[0] if drive is None else drive)
+        car.tick(standing.commands, standing.drives[0])
     return car
 
 

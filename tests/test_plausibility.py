@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from city import BEFORE_RELEASE, CLAMPING, HOLDING, RELEASED, drive, estimated
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import accelerate, rest, simulate_log, stop
-from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
 
 _LASTING = 500
@@ -74,7 +73,7 @@ def test_no_alarm_on_a_good_brake(seed):
 @pytest.mark.parametrize(("rise", "seed"), [(0.9, 0), (1.5, 1), (1.2, 2)])
 def test_breakaway_friction_that_the_calibration_knows_holds_a_motor_that_stands(rise, seed):
     """Twice the sliding one and more: without it the torque of a held brake is beyond what friction at rest can carry."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     known = {"stribeck_friction": {"rise": rise, "speed_rad_per_s": 6.0}} | calibration.effects
     friction = msgspec.structs.replace(calibration.friction, load_m_per_rad=1.3 * calibration.friction.load_m_per_rad)
     calibration = msgspec.structs.replace(calibration, friction=friction, effects=known)
@@ -232,7 +231,7 @@ def test_resolver_that_has_slipped_on_its_shaft_is_covered_as_soon_as_the_motor_
 def test_a_torque_that_friction_or_an_uneven_disc_may_hold_swings_beside_a_standing_angle(times, wheel_turns, stuck):
     """Once a second, by so many ``times`` the dry friction to either side. Breakaway takes 1.3 of it, what friction may be
     beyond its calibration up to 2.9; a disc that turns may be uneven and carry some more."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     dry_A = calibration.friction.offset_Nm / calibration.motor.torque_constant_Nm_per_A
 
     def swing(samples):
@@ -301,7 +300,7 @@ def test_a_current_that_is_lost_where_only_the_torque_was_left_leaves_nothing():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_speed_that_becomes_noisy_counts_as_such(seed):
     """Eight times as noisy: a motor that stands shows it, and what inertia would then make of the torque is no news."""
-    noise = 8.0 * load_calibration(resource("config/calibration.yaml")).noise.speed_rad_per_s
+    noise = 8.0 * shipped_calibration().noise.speed_rad_per_s
 
     def change(rows):
         rows["speed"][RELEASED:] += noise * np.random.default_rng(seed).standard_normal(len(rows) - RELEASED)

@@ -62,14 +62,14 @@ def drive():
     return frames[first[500] : first[600]], frames[first[600] : first[1000]]
 
 
-def reload_now(daemon, seconds=20.0):
+def reload_now(daemon):
     """Read the files again and go over to them, as the loop does from tick to tick."""
     daemon.reload()
-    end_reload(daemon, seconds)
+    end_reload(daemon)
 
 
-def end_reload(daemon, seconds=20.0):
-    end = time.monotonic() + seconds
+def end_reload(daemon):
+    end = time.monotonic() + 20.0
     daemon._follow_reload()
     while daemon._reader is not None or daemon._waiting:
         assert time.monotonic() < end, "not read in time"

@@ -34,7 +34,7 @@ def two_corners(tmp_path):
     frames = np.concatenate([parts["FL"], parts["RR"][~np.isin(parts["RR"]["can_id"], shared)]])
     parts["FL, RR"] = frames
     for name, part in parts.items():
-        ordered = part[np.argsort(part["time_ns"], kind="stable")]
+        ordered = wirekit.merged(part)
         ordered["time_ns"] += 1_000_000_000
         (tmp_path / f"{name.replace(', ', '_')}.log").write_text(format_candump(ordered))
     return tmp_path
@@ -71,9 +71,9 @@ def test_frames_of_all_corners_are_those_of_the_corners_heard(two_corners):
 def test_which_signal_is_out_of_range_is_said(tmp_path, capsys):
     """The reason on the wire says no more than that something is: of a thermocouple without its wire, four frames."""
     before, after = _cut(0, 100, 20.0), _cut(100, 110, 3000.0)
-    frames = np.concatenate([*before, *after, *_cut(110, 400, 20.0)])
+    frames = wirekit.merged(*before, *after, *_cut(110, 400, 20.0))
     frames["time_ns"] += 1_000_000_000
-    (tmp_path / "a.log").write_text(format_candump(frames[np.argsort(frames["time_ns"], kind="stable")]))
+    (tmp_path / "a.log").write_text(format_candump(frames))
     assert main(["replay", str(tmp_path / "a.log")]) == 0
     told = capsys.readouterr()
     assert "signal out of range" in told.out
@@ -134,7 +134,7 @@ def test_temperatures_of_a_second_log_are_judged_at_its_own_times(rig):
     shift = second.estimates["time_ns"][0] - first.estimates["time_ns"][0]
     assert shift > 0 and np.array_equal(first.time_ns, second.time_ns)
     expected = temperature_figures(second.estimates["time_ns"], second.estimates, second.reference)
-    assert second.figures()["temperature_K"] == expected
+    assert second.figures["temperature_K"] == expected
     assert expected["disc"]["samples"] > 900
 
 

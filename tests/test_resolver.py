@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from diagnosekit import drives
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.offline import estimate, log_of
-from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
 
 
@@ -114,7 +113,7 @@ def test_a_speed_that_is_wrong_for_good_is_said_and_covered():
 def test_teeth_stay_where_they_are_when_the_zero_moves(known_as):
     """A mesh ripple of 6 % is known by its place on the shaft. With the angle as it is read it would be another one, and the
     rest of the drive went from 27 to 334 N."""
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     ripple = {"cosine": 0.06, "sine": 0.0, "order_per_turn": 9.5}
     log = log_of(next(drives(calibration, 3, {"gear_mesh_ripple": ripple})))
     known = msgspec.convert(msgspec.to_builtins(calibration) | known_as(calibration, ripple), Calibration)

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.write import write_frames
 from emb_daemon.offline import load_log
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.resources import resource
 from studies import rewritten
 
 #: Ways that change nothing but how numbers are written.
@@ -24,7 +23,7 @@ _SAME = [
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "clamp.log"
-    plant = plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed=3)
+    plant = plant_from_calibration(shipped_calibration(), seed=3)
     write_frames(path, sc.simulate_log(plant, sc.rest(0.5) + sc.park(15e3, 3.0), seed=4)[0])
     return path
 

@@ -10,11 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.unknown import LEAST_SCALE, MOST_SCALE
 from emb_daemon.offline import estimate, load_log
-from emb_daemon.resources import resource
 from emb_daemon.wire import contract as r
 
 #: Bounds of the error on static/random_*mm, RMSE in N: dynamic stiffness, torque balance, maximum likelihood, Kalman filter.
@@ -30,7 +29,7 @@ _THICKNESSES = {"0p5": 0.5, "3p5": 3.5, "5": 5.0, "6p5": 6.5, "9p5": 9.5, "11p5"
 
 
 def _parameters(pad_thickness_mm: float = 10.0):
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     return to_parameters(msgspec.structs.replace(calibration, pad_thickness_mm=pad_thickness_mm))
 
 

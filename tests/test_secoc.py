@@ -189,8 +189,7 @@ def test_check_value_of_the_documentation():
 @cache
 def drive():
     """Frames of FL's brake and its car: four seconds, never at rest."""
-    frames = np.concatenate(_sliding(1000, start_ns=_START_NS))
-    return frames[np.argsort(frames["time_ns"], kind="stable")]
+    return wirekit.merged(*_sliding(1000, start_ns=_START_NS))
 
 
 @cache
@@ -207,13 +206,12 @@ def fresh(frames):
     return int(np.sum(frames["flags"] == 0)), int(np.sum(frames["flags"] == UNAUTHENTIC))
 
 
-def merged(*parts):
-    frames = np.concatenate(parts)
-    return frames[np.argsort(frames["time_ns"], kind="stable")]
+def new_pipeline():
+    return Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 13)
 
 
 def estimates_of(frames, pipeline=None):
-    pipeline = pipeline or Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 13)
+    pipeline = pipeline or new_pipeline()
     pipeline.begin(_START_NS)
     _, count = pipeline.collect(frames, predictions=False)
     pipeline.answer(count)
@@ -291,9 +289,7 @@ def test_who_silences_the_sender_and_plays_back_its_frames_is_not_believed():
     again["time_ns"] += half - _START_NS
     frames = verifier().verify(np.concatenate([before, again]))
     assert fresh(frames)[0] == int(np.sum(~np.isin(before["can_id"], [AUTH, FRESHNESS, VEHICLE_AUTH, 0x184])))
-    estimates = estimates_of(
-        frames, pipeline := Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 13)
-    )
+    estimates = estimates_of(frames, pipeline := new_pipeline())
     assert len(estimates) <= 500
     count = pipeline.overdue(int(again["time_ns"][-1]))
     pipeline.answer(count)
@@ -476,7 +472,7 @@ def test_frames_of_other_kinds_pass_to_be_refused_for_that():
 def test_without_a_key_the_status_is_fault(missing, tmp_path):
     authentication = Authentication(RECEIVED, SENT, {k: v for k, v in KEYS.items() if k != missing}, Freshness(trip=1))
     assert [link.name for link in authentication.keyless] == [missing]
-    pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 13)
+    pipeline = new_pipeline()
     pipeline.distrust({link.corner for link in authentication.keyless})
     pipeline.begin(_START_NS)
     _, count = pipeline.consume(authentication.verify(signed()))
@@ -490,7 +486,7 @@ def test_without_a_key_the_status_is_fault(missing, tmp_path):
 
 def test_what_is_sent_is_believed_by_who_has_the_key(tmp_path):
     daemon = opened(tmp_path)
-    pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",), capacity=1 << 13)
+    pipeline = new_pipeline()
     pipeline.begin(_START_NS)
     _, count = pipeline.consume(daemon.verify(signed()))
     plain = pipeline.broadcast(count).copy()
@@ -746,7 +742,7 @@ def test_a_running_daemon_hears_and_says_what_a_replay_of_its_bus_does(tmp_path)
     running.daemon._bus = SecuredBus(running.daemon._bus, opened(tmp_path / "state"))
     genuine = signed()[: of(signed(), AUTH)[250] + 1]
     foreign = attacks.forged(next(iter(attacks.FORGERIES)), signed(), np.random.default_rng(2), KEYS)
-    mixed = merged(foreign[foreign["time_ns"] < genuine["time_ns"][-1]], genuine)
+    mixed = wirekit.merged(foreign[foreign["time_ns"] < genuine["time_ns"][-1]], genuine)
     log = []
     with running:
         for frames in np.split(mixed, np.flatnonzero(np.diff((mixed["time_ns"] - _START_NS) // CYCLE_NS)) + 1):
@@ -757,7 +753,7 @@ def test_a_running_daemon_hears_and_says_what_a_replay_of_its_bus_does(tmp_path)
         heard = running.wait_for(lambda frames: len(answers(frames)) >= samples)
     believed = Verifier(SENT, KEYS, {}).verify(heard)
     assert np.all(believed["flags"] == 0) and np.sum(believed["can_id"] == 0x200) == np.sum(heard["can_id"] == 0x200)
-    pipeline = Pipeline(Setup(resource("config/emb.yaml")).parameters, ("FL",))
+    pipeline = new_pipeline()
     pipeline.begin(int(log[0]["time_ns"][0]))
     _, count = pipeline.collect(verifier().verify(np.concatenate(log)), predictions=False)
     pipeline.answer(count)

@@ -15,7 +15,7 @@ from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs.live import MappedBus, ReferenceBus, SeveralBuses, open_buses, open_mapped
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.simulated import SimulatedRig
-from emb_daemon.monitor.listener import Listener
+from emb_daemon.monitor.listener import Listener, broadcast_ids
 from emb_daemon.monitor.view import summary
 from emb_daemon.offline import load_log
 from emb_daemon.offline.log import log_of
@@ -201,7 +201,7 @@ def test_simulate_and_monitor_take_a_mapping(tmp_path, capsys):
     mapping, threads = foreignkit.write_rig(tmp_path), threading.active_count()
     listening = can.Bus(interface="virtual", channel="rigs", fd=True)
     bus = ["-i", "virtual", "-c", "rigs", "--mapping", str(mapping)]
-    monitor = ReferenceBus(listening, Mapping(mapping), Listener().ids)
+    monitor = ReferenceBus(listening, Mapping(mapping), broadcast_ids())
     assert main(["simulate", "--corners", "1", "--seconds", "0.4", "--reference", *bus]) == 0
     broadcast = can.Bus(interface="virtual", channel="rigs")
     force = int(wirekit.frame("EMB_FL_ClampForce", 0, ClampForce=5.0, ClampForceSigma=0.1)["data"][0])

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.estimator.records import ESTIMATE
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import FORCE
@@ -35,7 +35,7 @@ def honest():
 
 @pytest.fixture(scope="module")
 def plant():
-    return plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed=3)
+    return plant_from_calibration(shipped_calibration(), seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +220,7 @@ def test_another_brake_has_its_share_of_forces_and_of_sizes(plant):
     assert half[1] == own[1]
     sizes = [FAMILIES["current_offset"](np.random.default_rng(2), own[1], size).size for size in (Size(), Size(current=0.5))]
     assert float(sizes[1].split()[0]) == pytest.approx(0.5 * float(sizes[0].split()[0]), abs=0.01)
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     constant = 2.0 * calibration.motor.torque_constant_Nm_per_A
     motor = msgspec.structs.replace(calibration.motor, torque_constant_Nm_per_A=constant)
     assert size_of(msgspec.structs.replace(calibration, motor=motor), calibration) == Size(1.0, 0.5, 1.0)

@@ -29,23 +29,21 @@ def _clamped(p, past_contact, seconds=2.0, current=True):
     return rows, force
 
 
-def _standing(p, seconds=1.0):
-    rows, force = brake.samples(p, np.zeros(round(seconds / 0.004)))
-    return rows, force
+def _standing(p):
+    return brake.samples(p, np.zeros(250))
 
 
 def _unknown(estimates):
     return (estimates["reasons"] & r.CONTACT_UNCERTAIN) != 0
 
 
-def _covered(estimates, force, sigmas=3.0):
-    return np.all(np.abs(estimates["force"] - force) < sigmas * estimates["sigma"])
+def _covered(estimates, force):
+    return np.all(np.abs(estimates["force"] - force) < 3.0 * estimates["sigma"])
 
 
 def test_a_released_brake_is_known_from_the_first_sample_on(p):
     """Nobody brakes, the park brake is off: the clearance counts from where the motor stands, and the first stroke is
-    answered by
-    both paths."""
+    answered by both paths."""
     rows, force = brake.samples(p, np.concatenate([np.zeros(50), brake.clamp(p, 15.0, 0.3)]))
     estimates = estimate(rows, p)
     assert not np.any(_unknown(estimates)) and not np.any(estimates["source"][1:] == r.TORQUE_ONLY)

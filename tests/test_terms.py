@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_daemon.calibration.files import dump_calibration, load_calibration
+from emb_daemon.calibration.files import dump_calibration, shipped_calibration
 from emb_daemon.calibration.strict_yaml import load_yaml
 from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.calibration.types import Calibration, to_parameters
@@ -24,7 +24,6 @@ from emb_daemon.errors import InputErrors, InvalidValue
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.offline import estimate
 from emb_daemon.offline.run import held, run_step
-from emb_daemon.resources import resource
 
 DT = 0.004
 
@@ -32,7 +31,7 @@ DT = 0.004
 @pytest.fixture(scope="module")
 def calibration():
     """The shipped one without effects, whose terms would add up with those here."""
-    return msgspec.structs.replace(load_calibration(resource("config/calibration.yaml")), effects={})
+    return msgspec.structs.replace(shipped_calibration(), effects={})
 
 
 def constant(port, coefficient, **more):

@@ -313,14 +313,14 @@ def test_an_accepted_evaluation_takes_effect_with_what_came_since(parked):
     assert a["snapshot_ns"] == 12
 
 
-def strokes(parked, *forces, dt=0.25):
-    """Whether a full stroke has been seen after each of these forces."""
+def strokes(parked, *forces):
+    """Whether a full stroke has been seen after each of these forces, a quarter of a second apart."""
     a, _, _, limits = parked
     limits["high_force"], limits["low_force"], limits["coverage"] = 10_000.0, 100.0, 0.8
     seen = []
     for force in forces:
         a["force"] = force
-        seen.append(bool(training._stroke(a, limits, dt)))
+        seen.append(bool(training._stroke(a, limits, 0.25)))
     return seen
 
 

@@ -70,12 +70,12 @@ def test_an_even_disc_stays_even(p, seed):
 
 # The filter alone.
 
-_VARIANCE, _SLOPE = 0.02**2, 2000.0
+_VARIANCE, _SLOPE, _LEVERAGE = 0.02**2, 2000.0, 4e-5
 #: Between which the log odds of an uneven disc stay.
 _LOG_ODDS_LIMITS = (-6.0, 20.0)
 
 
-def _feed(u, p, amplitude_m, seconds, seed=1, begin=0.0, strokes=True, leverage=4e-5):
+def _feed(u, p, amplitude_m, seconds, seed=1, begin=0.0, strokes=True):
     """A disc under a constant slope of the force; the pads leave it every second if ``strokes``. Returns the
     highest log odds that it had."""
     highest, rows, rng = -np.inf, brake.samples(p, np.zeros(round(seconds / 0.004) + 1))[0], np.random.default_rng(seed)
@@ -88,7 +88,7 @@ def _feed(u, p, amplitude_m, seconds, seed=1, begin=0.0, strokes=True, leverage=
         uneven.turn(u, rows[i], _SLOPE if touching else 0.0, p["gear_gain"], 1e-6)
         shapes[:] = [f(k * turned) for k in (1, 2) for f in (np.cos, np.sin)]
         more = _SLOPE / p["gear_gain"] * (shapes @ amplitude_m) * touching
-        uneven.learn(u, leverage, leverage * more + np.sqrt(_VARIANCE) * rng.standard_normal(), _VARIANCE, 0.004)
+        uneven.learn(u, _LEVERAGE, _LEVERAGE * more + np.sqrt(_VARIANCE) * rng.standard_normal(), _VARIANCE, 0.004)
         highest = max(highest, float(u["log_odds"]))
     return highest
 
@@ -151,7 +151,7 @@ def test_until_something_speaks_for_it_the_force_is_that_of_an_even_disc(u, p):
 def test_a_torque_that_no_disc_explains_teaches_nothing(u, p):
     _feed(u, p, 1e-6 * np.array([8.0, -3.0, 1.5, 0.0]), 6.0)
     before = u.copy()
-    uneven.learn(u, 4e-5, 100.0 * np.sqrt(_VARIANCE), _VARIANCE, 0.004)
+    uneven.learn(u, _LEVERAGE, 100.0 * np.sqrt(_VARIANCE), _VARIANCE, 0.004)
     assert np.all(u["amplitude"] == before["amplitude"]) and u["log_odds"] == before["log_odds"]
 
 

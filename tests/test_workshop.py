@@ -27,7 +27,7 @@ from emb_daemon.cli.main import main
 from emb_daemon.errors import Unavailable
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE
 from emb_daemon.estimator.status import TABLE, names
-from emb_daemon.monitor.listener import Listener
+from emb_daemon.monitor.listener import broadcast_ids
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.live import LiveCar
@@ -52,9 +52,9 @@ _SHARED = ("stiffness_force_N", "stiffness_sigma_N", "torque_force_N", "torque_s
 _NOT_SHARED = [0xFFFF] * 4 + [0xFFFFFFFF]
 
 
-def _judge(memory, reasons, times=3, corner=FL, mode=DEGRADED, frame=_FRAME, now_s=0.0):
+def _judge(memory, reasons, times=3, corner=FL, mode=DEGRADED, frame=_FRAME):
     for _ in range(times):
-        memory.judge(corner, mode, reasons, frame, now_s)
+        memory.judge(corner, mode, reasons, frame, 0.0)
     return [memory.entries[code_of(corner, bit)] for bit in range(len(REASONS))]
 
 
@@ -264,7 +264,7 @@ class _Served:
     def __init__(self, channel: str, state: Path):
         from emb_daemon.workshop.serve import Diagnostics
 
-        self.bus = open_bus("virtual", channel, [*Listener().ids, 0x710])
+        self.bus = open_bus("virtual", channel, [*broadcast_ids(), 0x710])
         self.daemon = open_bus("virtual", channel, [])
         self.diagnostics = Diagnostics(self.bus, _CONFIGURATION, state, 0x710, 0x718, state / "estimates")
         self._stop, self._counter = threading.Event(), 0

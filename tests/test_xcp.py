@@ -42,10 +42,10 @@ def _address(corner: int, name: str) -> int:
 class _Loop:
     """What a daemon's loop tells, without the daemon: row ``n`` of a corner has a force of 1000 * corner + n."""
 
-    def __init__(self, path: Path, capacity: int = 1024, parameters=None):
+    def __init__(self, path: Path, parameters=None):
         self.pipeline = SimpleNamespace(
-            samples=np.zeros(capacity, SAMPLE),
-            estimates=np.zeros(capacity, ESTIMATE),
+            samples=np.zeros(1024, SAMPLE),
+            estimates=np.zeros(1024, ESTIMATE),
             parameters=Setup(_CONFIGURATION).parameters if parameters is None else parameters,
         )
         self.shared = SharedEstimates(path, self.pipeline)

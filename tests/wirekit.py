@@ -43,6 +43,12 @@ def decode(frame_record) -> tuple[str, dict]:
     return found.name, found.decode(data, decode_choices=False)
 
 
+def merged(*parts: np.ndarray) -> np.ndarray:
+    """Frames of all parts in order of time; of equal times, in the order of the parts."""
+    frames = np.concatenate(parts)
+    return frames[np.argsort(frames["time_ns"], kind="stable")]
+
+
 def same(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two arrays of records hold the same bits, but for those between fields."""
     return all(a[name].tobytes() == b[name].tobytes() for name in a.dtype.names)
@@ -57,7 +63,6 @@ def drive(
     current=(0.0,),
     wheel_speed: float = 0.0,
     backplate: float = 20.0,
-    ambient: float = 20.0,
     first: int = 0,
 ) -> list[np.ndarray]:
     """Frames of one corner and its car for ``cycles`` resolver cycles from cycle ``first`` on.
@@ -69,7 +74,7 @@ def drive(
         now, counter = start_ns + cycle * 4 * MS, cycle % 15
         at = [signal[cycle % len(signal)] for signal in (angle, speed, current)]
         if cycle % 25 == 0:
-            frames.append(frame("VEH_Status", now - 3000, cycle // 25 % 15, AmbientTemp=ambient))
+            frames.append(frame("VEH_Status", now - 3000, cycle // 25 % 15, AmbientTemp=20.0))
         if cycle % 5 in (0, 2):
             slow = (2 * (cycle // 5) + (cycle % 5 > 0)) % 15
             frames.append(

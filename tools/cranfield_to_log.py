@@ -28,22 +28,18 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from no_pads import starting_calibration
+from no_pads import convert, parser_of, starting_calibration
 
-from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import save_calibration
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
-from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.resample import fill_missing, frames_of
 from emb_daemon.logs.series import Series
 
 LEAD_M = 5e-3
 GEAR_GAIN_M_PER_RAD = LEAD_M / (2.0 * np.pi)
 NEWTON_PER_KGF = 9.80665
-LOADS_KGF = (-40, 20, 40)
-#: What a first guess says: torque per ampere of supply, N m/A; Coulomb friction, N m; of screw and rotor, kg m2.
+#: A first guess: torque per ampere of supply, N m/A; Coulomb friction, N m; of screw and rotor, kg m2.
 NOMINAL_CONSTANT, NOMINAL_COULOMB, NOMINAL_INERTIA = 1.5, 0.7, 3e-5
 #: Supply current of the drive while the nut stands, A: the middle of the normal runs'.
 STANDSTILL_A = 0.36
@@ -105,7 +101,7 @@ def frames(part: dict[str, np.ndarray], load_kgf: int, with_load: bool = True) -
 
 
 def calibration_to_start_from() -> Calibration:
-    """What one would guess."""
+    """The calibration of a first guess."""
     start = starting_calibration(
         "Cranfield",
         torque_constant_Nm_per_A=NOMINAL_CONSTANT,
@@ -118,25 +114,18 @@ def calibration_to_start_from() -> Calibration:
     return moved(start, {"stiffness.maximum_force_N": 500.0})
 
 
+def _logs_and_start(arguments: argparse.Namespace) -> tuple[dict[str, np.ndarray], Calibration]:
+    runs = {key: part for key, part in read(arguments.table).items() if key[1] in arguments.runs}
+    logs = {f"run{run}_{load}kgf": frames(part, load, not arguments.without_load) for (load, run), part in runs.items()}
+    return logs, calibration_to_start_from()
+
+
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("table", type=Path, help="normal.csv, backlash1.csv, ...")
     parser.add_argument("--runs", type=int, nargs="+", default=list(range(1, 11)), metavar="N", help="1 to 10 (all)")
     parser.add_argument("--without-load", action="store_true", help="leave the reference force out")
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    arguments = parser.parse_args(argv)
-    try:
-        runs = read(arguments.table)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    for (load, run), part in runs.items():
-        if run in arguments.runs:
-            content = format_candump(frames(part, load, not arguments.without_load)).encode()
-            write_atomically(arguments.output / f"run{run}_{load}kgf.log", content)
-    save_calibration(calibration_to_start_from(), arguments.output / "calibration.yaml")
-    return 0
+    return convert(parser.parse_args(argv), _logs_and_start)
 
 
 if __name__ == "__main__":

@@ -22,16 +22,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from no_pads import starting_calibration
+from no_pads import convert, parser_of, starting_calibration
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import save_calibration
-from emb_daemon.errors import InputError, InputErrors
-from emb_daemon.logs.candump import format_candump
+from emb_daemon.calibration.types import Calibration
+from emb_daemon.errors import InputError
 from emb_daemon.logs.mapping import Mapping
 
 GEAR_GAIN_M_PER_RAD = 5e-4
-#: Of rotor and coupling, kg m2; motor friction, N m: what a datasheet would say.
+#: As a datasheet would give them: inertia of rotor and coupling, kg m2; motor friction, N m.
 NOMINAL_INERTIA, NOMINAL_COULOMB = 1e-4, 0.02
 
 MAPPING = """# Columns of the EMBiR dynamometer.
@@ -47,7 +46,7 @@ signals:
 
 
 def read_header(path: Path) -> tuple[float, str]:
-    """What a run states of itself: the first motor's torque constant, N m/A, and the torque sensor's column.
+    """Values that a run's header states: the first motor's torque constant, N m/A, and the torque sensor's column.
 
     Raises:
         InputError: not a run with both.
@@ -60,33 +59,22 @@ def read_header(path: Path) -> tuple[float, str]:
     return float(constant.group(1)), sensor.group(1)
 
 
-def write_logs(run: Path, mapping: str, folder: Path) -> None:
-    """A run as this mapping reads it, whole and in two halves, beside the mapping.
+def whole_and_halves(run: Path, mapping: str, folder: Path) -> dict[str, np.ndarray]:
+    """FRAME arrays of a run as this mapping reads it, which is left in ``folder``.
 
     Raises:
-        InputError, InputErrors, OSError: it cannot be read with it.
+        InputError, OSError: it cannot be read with it.
     """
     write_atomically(folder / "mapping.yaml", mapping.encode())
     frames = Mapping(folder / "mapping.yaml").read(run)
     half = np.searchsorted(frames["time_ns"], frames["time_ns"][[0, -1]].mean())
-    for name, part in (("run", frames), ("first_half", frames[:half]), ("second_half", frames[half:])):
-        write_atomically(folder / f"{name}.log", format_candump(part).encode())
+    return {"run": frames, "first_half": frames[:half], "second_half": frames[half:]}
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, help="one run, futek_test_*.csv")
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    arguments = parser.parse_args(argv)
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    try:
-        constant, sensor = read_header(arguments.run)
-        mapping = MAPPING.format(sensor=sensor, newton_per_Nm=1.0 / GEAR_GAIN_M_PER_RAD)
-        write_logs(arguments.run, mapping, arguments.output)
-    except (OSError, InputError, InputErrors) as error:
-        print(error, file=sys.stderr)
-        return 2
-    start = starting_calibration(
+def _logs_and_start(arguments: argparse.Namespace) -> tuple[dict[str, np.ndarray], Calibration]:
+    constant, sensor = read_header(arguments.run)
+    mapping = MAPPING.format(sensor=sensor, newton_per_Nm=1.0 / GEAR_GAIN_M_PER_RAD)
+    return whole_and_halves(arguments.run, mapping, arguments.output), starting_calibration(
         "EMBiR",
         torque_constant_Nm_per_A=constant,
         inertia_kg_m2=NOMINAL_INERTIA,
@@ -95,8 +83,12 @@ def main(argv: list[str] | None = None) -> int:
         gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
         maximum_speed_rad_per_s=250.0,
     )
-    save_calibration(start, arguments.output / "calibration.yaml")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("run", type=Path, help="one run, futek_test_*.csv")
+    return convert(parser.parse_args(argv), _logs_and_start)
 
 
 if __name__ == "__main__":

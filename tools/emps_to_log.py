@@ -24,12 +24,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from no_pads import starting_calibration
+from no_pads import convert, parser_of, starting_calibration
 
-from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import save_calibration
+from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
-from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.resample import frames_of
 from emb_daemon.logs.series import Series
 from emb_daemon.wire.contract import CYCLE_NS
@@ -90,7 +88,7 @@ def frames(columns: dict[str, np.ndarray], begin: float = 0.0, end: float = 1.0)
     )
 
 
-def in_units_of_the_carriage(calibration) -> dict[str, float]:
+def in_units_of_the_carriage(calibration: Calibration) -> dict[str, float]:
     """Mass kg, viscous N s/m, Coulomb N and offset N of a calibration that diagnose has written."""
     gamma, effects = GEAR_GAIN_M_PER_RAD, calibration.effects
     torque = calibration.motor.torque_constant_Nm_per_A
@@ -103,26 +101,10 @@ def in_units_of_the_carriage(calibration) -> dict[str, float]:
     }
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, help="DATA_EMPS.mat")
-    parser.add_argument("pulses", type=Path, help="DATA_EMPS_PULSES.mat")
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    arguments = parser.parse_args(argv)
-    try:
-        run, pulses = read(arguments.run), read(arguments.pulses)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    for name, part in (
-        ("first_half", frames(run, 0.0, 0.5)),
-        ("second_half", frames(run, 0.5, 1.0)),
-        ("pulses", frames(pulses)),
-    ):
-        write_atomically(arguments.output / f"{name}.log", format_candump(part).encode())
-    gamma = GEAR_GAIN_M_PER_RAD
-    start = starting_calibration(
+def _logs_and_start(arguments: argparse.Namespace) -> tuple[dict[str, np.ndarray], Calibration]:
+    run, pulses, gamma = read(arguments.run), read(arguments.pulses), GEAR_GAIN_M_PER_RAD
+    logs = {"first_half": frames(run, 0.0, 0.5), "second_half": frames(run, 0.5, 1.0), "pulses": frames(pulses)}
+    return logs, starting_calibration(
         "EMPS",
         torque_constant_Nm_per_A=gamma * float(run["gtau"][0]) / AMPERE_PER_VOLT,
         inertia_kg_m2=gamma**2 * NOMINAL_MASS_KG,
@@ -131,8 +113,13 @@ def main(argv: list[str] | None = None) -> int:
         gear_gain_m_per_rad=gamma,
         maximum_speed_rad_per_s=1000.0,
     )
-    save_calibration(start, arguments.output / "calibration.yaml")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("run", type=Path, help="DATA_EMPS.mat")
+    parser.add_argument("pulses", type=Path, help="DATA_EMPS_PULSES.mat")
+    return convert(parser.parse_args(argv), _logs_and_start)
 
 
 if __name__ == "__main__":

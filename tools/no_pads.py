@@ -1,13 +1,46 @@
-"""Where to start from with a drive that clamps nothing: the thesis's torque balance, and no other effect."""
+"""Common parts of the converters of drives that clamp nothing: their command line, and the calibration to start from, which is
+the thesis's torque balance without other effects."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
+import numpy as np
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.atomic import write_atomically
+from emb_daemon.calibration.files import save_calibration, shipped_calibration
 from emb_daemon.calibration.types import Calibration
-from emb_daemon.resources import resource
+from emb_daemon.errors import InputError
+from emb_daemon.logs.candump import format_candump
 
 #: Clearance that no motion closes, rad.
 NEVER = 1e4
+
+
+def parser_of(text: str) -> argparse.ArgumentParser:
+    """Parser of a converter that ``text`` describes, with --output."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    return parser
+
+
+def convert(
+    arguments: argparse.Namespace, logs_and_start: Callable[[argparse.Namespace], tuple[dict[str, np.ndarray], Calibration]]
+) -> int:
+    """Write the logs (FRAME arrays, by name) and the calibration that a converter makes of its ``arguments`` into --output;
+    returns the exit status."""
+    try:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        logs, start = logs_and_start(arguments)
+        for name, frames in logs.items():
+            write_atomically(arguments.output / f"{name}.log", format_candump(frames).encode())
+        save_calibration(start, arguments.output / "calibration.yaml")
+    except (OSError, InputError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
 
 
 def starting_calibration(
@@ -21,7 +54,7 @@ def starting_calibration(
     maximum_speed_rad_per_s: float,
 ) -> Calibration:
     """Inertia and Coulomb friction as a datasheet would say, everything else as shipped."""
-    base, replace = load_calibration(resource("config/calibration.yaml")), msgspec.structs.replace
+    base, replace = shipped_calibration(), msgspec.structs.replace
     motor = {
         "torque_constant_Nm_per_A": torque_constant_Nm_per_A,
         "inertia_kg_m2": inertia_kg_m2,

@@ -16,11 +16,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from embir_to_log import GEAR_GAIN_M_PER_RAD, write_logs
-from no_pads import starting_calibration
+import numpy as np
+from embir_to_log import GEAR_GAIN_M_PER_RAD, whole_and_halves
+from no_pads import convert, parser_of, starting_calibration
 
-from emb_daemon.calibration.files import save_calibration
-from emb_daemon.errors import InputError, InputErrors
+from emb_daemon.calibration.types import Calibration
 
 CONSTANT_NM_PER_A = 0.945
 #: At the shaft, of rotor and gear, kg m2; of the gear, N m; fastest, rad/s: orders of magnitude of the supplier's sheet.
@@ -37,18 +37,8 @@ signals:
 """
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, help="one run, log_adc_and_motor.csv")
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    arguments = parser.parse_args(argv)
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    try:
-        write_logs(arguments.run, MAPPING, arguments.output)
-    except (OSError, InputError, InputErrors) as error:
-        print(error, file=sys.stderr)
-        return 2
-    start = starting_calibration(
+def _logs_and_start(arguments: argparse.Namespace) -> tuple[dict[str, np.ndarray], Calibration]:
+    return whole_and_halves(arguments.run, MAPPING, arguments.output), starting_calibration(
         "AK80-9",
         torque_constant_Nm_per_A=CONSTANT_NM_PER_A,
         inertia_kg_m2=NOMINAL_INERTIA,
@@ -57,8 +47,12 @@ def main(argv: list[str] | None = None) -> int:
         gear_gain_m_per_rad=GEAR_GAIN_M_PER_RAD,
         maximum_speed_rad_per_s=FASTEST,
     )
-    save_calibration(start, arguments.output / "calibration.yaml")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("run", type=Path, help="one run, log_adc_and_motor.csv")
+    return convert(parser.parse_args(argv), _logs_and_start)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """The part of adaptation that is not done in a tick: evaluation, memory, words for the log.
 
-In the daemon a helper thread does this, without real-time priority, and while it computes without the interpreter's lock. In a
-replay it is done at once. In both the result takes effect at the same sample. Only the loop accesses the values in use: the
-helper thread gets copies and returns its results.
+In the daemon a helper thread does this; it has no real-time priority, and releases the interpreter's lock while it computes.
+In a replay it is done at once. In both the result takes effect at the same sample. Only the loop accesses the values in use:
+the helper thread gets copies and returns its results.
 """
 
 import contextlib
@@ -81,7 +81,7 @@ class Adaptation:
                 self._resumable[CORNERS.index(name)] = snapshot, time_ns
 
     def read(self, corner: str, calibration: Calibration) -> Store:
-        """What is stored for a corner with this calibration. May take long; changes nothing in use."""
+        """A corner's store for this calibration (`Memory.load`). May take long; changes nothing in use."""
         store, warning = self._memory.load(corner, calibration)
         if warning:
             log.warning("corner %s: %s", corner, warning)

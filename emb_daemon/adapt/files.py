@@ -53,8 +53,8 @@ def read(path: Path) -> bytes:
 
 
 def decode(data: bytes, kind: type[_Kept], version: int) -> _Kept:
-    """What `encode` was given, of type ``kind``, whose ``format`` must be ``version``. Raises ValueError: not such a file, or
-    damaged; says which."""
+    """The object that `encode` was given. Raises ValueError, which says what is wrong: the file is damaged, is not of type
+    ``kind``, or its ``format`` is not ``version``."""
     try:
         file = msgspec.json.decode(data, type=_Sealed)
         if hashlib.sha256(bytes(file.content)).hexdigest() != file.sha256:

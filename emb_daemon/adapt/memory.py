@@ -121,7 +121,7 @@ class Memory:
         return files.decode(content, Store, FORMAT)
 
     def load(self, corner: str, calibration: Calibration) -> tuple[Store, str | None]:
-        """What is stored for a corner with this calibration, and a warning for the log or None.
+        """A corner's store for this calibration, empty if there is none; and a warning for the log or None.
 
         A file that is damaged, or contains values that are impossible for this brake, is set aside. A file of another actuator
         or calibration is not used, and stays until something new is learned.

@@ -18,9 +18,9 @@ _FORMAT = 1
 class Snapshot(files.Owned, frozen=True, kw_only=True):
     """One corner's file, of the calibration in use, learned values included."""
 
-    #: CLOCK_REALTIME.
+    #: Time of the snapshot, CLOCK_REALTIME.
     time_ns: int
-    #: By the dtype's field names; arrays as nested lists, null for NaN.
+    #: Values by field name of the dtype; arrays as nested lists, null for NaN.
     state: dict[str, object]
 
 

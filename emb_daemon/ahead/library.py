@@ -61,11 +61,11 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Description of a library, stored in it."""
 
     format: int = _FORMAT
-    #: Of the ELF object before this line, followed by the layouts.
+    #: Digest of the ELF object before this line, followed by the layouts.
     sha256: str
-    #: `source_digest` of what it was made from.
+    #: `source_digest` of the package that it was made from.
     sources: str
-    #: As uname says it; the CPU that it was compiled for, and the flags of /proc/cpuinfo that this takes.
+    #: Machine by uname; the CPU that it was compiled for, and the flags of /proc/cpuinfo that this takes.
     machine: str
     cpu: str
     flags: tuple[str, ...]
@@ -80,7 +80,7 @@ class Refused(Exception):
 
 
 def source_digest(package: Path) -> str:
-    """Of all sources in ``package`` that compiled code can depend on."""
+    """Digest of all sources in ``package`` that compiled code can depend on."""
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
@@ -139,7 +139,7 @@ def find() -> Path | None:
 
 
 def seal(elf: bytes, layouts: dict[str, bytes], **manifest: str | tuple[str, ...]) -> bytes:
-    """A library's bytes."""
+    """Bytes of a library's file: the ELF object, and the `Manifest` of these ``layouts`` and further fields."""
     return elf + b"\n" + msgspec.json.encode(Manifest(sha256=_sha256(elf, layouts), layouts=layouts, **manifest))
 
 
@@ -272,8 +272,8 @@ def _size(kind) -> int:
 
 
 def _address(array: np.ndarray) -> int:
-    """Of an array's first element: what ``array.ctypes.data`` says, in a fifth of its time. It is the first field after the
-    head that every object of CPython has."""
+    """Address of an array's first element: ``array.ctypes.data``, in a fifth of its time. It is the first field after the head
+    that every object of CPython has."""
     return ctypes.c_void_p.from_address(id(array) + object.__basicsize__).value or 0
 
 

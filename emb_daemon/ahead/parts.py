@@ -1,4 +1,4 @@
-"""Code in LLVM's form that becomes a part of other code: of kernels, or of a library."""
+"""Functions as LLVM's bitcode, which becomes a part of kernels or of a library."""
 
 from collections.abc import Callable
 
@@ -8,9 +8,10 @@ from numba.core.compiler import Compiler
 
 
 class Part(JITCodeLibrary):
-    """Code that only becomes a part of kernels, with which it is optimised and translated.
+    """The bitcode of a function that only kernels call; it is optimised and translated together with them.
 
-    numba's own libraries would do both before as well: of each function with all that it calls, once for each level of calls.
+    numba's own libraries would optimise and translate each function on its own as well, with all that it calls, once for each
+    level of calls.
     """
 
     def serialize_using_object_code(self) -> tuple[str, str, bytes]:
@@ -18,7 +19,7 @@ class Part(JITCodeLibrary):
 
     @property
     def codegen(self) -> "Part":
-        """Where numba would file constants of Python's for the machine code, which there is not."""
+        """Where numba registers Python's constants for machine code (`set_env`); there is none here."""
         return self
 
     def set_env(self, name: str, environment: object) -> None:
@@ -26,7 +27,7 @@ class Part(JITCodeLibrary):
 
     @classmethod
     def of_bitcode(cls, codegen: object, name: str, bitcode: bytes) -> "Part":
-        """What `serialize_using_bitcode` gave."""
+        """The part that `serialize_using_bitcode` wrote."""
         part = cls(codegen, name)
         part._final_module = parse_bitcode(bitcode)
         part._finalize_final_module()
@@ -41,7 +42,7 @@ class Part(JITCodeLibrary):
 
 
 class PartCompiler(Compiler):
-    """numba's, into what is neither optimised nor translated."""
+    """numba's compiler, except that the result is neither optimised nor translated."""
 
     def compile_extra(self, func: Callable) -> object:
         self.state.library = Part(self.state.targetctx.codegen(), func.__qualname__)

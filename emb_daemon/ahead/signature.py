@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-#: What a decorator takes and returns, its signature unchanged.
+#: A function, whose signature a decorator leaves unchanged.
 Function = TypeVar("Function", bound=Callable[..., object])
 
 

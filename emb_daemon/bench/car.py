@@ -12,14 +12,13 @@ import time
 
 import numpy as np
 
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.demo.recorder import Recorder
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.live import LiveCar
 from emb_daemon.plant.records import CYCLE_NS
 from emb_daemon.plant.scenarios import city_drive
-from emb_daemon.resources import resource
 from emb_daemon.runtime.rawcan import RawCanSocket
 from emb_daemon.runtime.realtime import settle_memory, use_fifo
 from emb_daemon.wire.layout import CORNERS
@@ -52,7 +51,7 @@ class _Bus:
 def main() -> None:
     corners, seconds, priority, descriptor = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
     bus = _Bus(descriptor)
-    calibration = load_calibration(resource("config/calibration.yaml"))
+    calibration = shipped_calibration()
     plants = np.array([plant_from_calibration(calibration, seed) for seed in range(corners)])
     live = LiveCar(Car(plants, CORNERS[:corners]), bus, city_drive())
     live.warm_up()

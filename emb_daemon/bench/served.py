@@ -116,8 +116,8 @@ class Ledger:
         return time.monotonic(), time.process_time(), self._daemon.ticks, self._daemon.missed, self._held_up
 
     def figures(self) -> dict[str, Any]:
-        """From the time when memory has settled to the last sample: share of a core, ticks, missed ticks, those held up by the
-        machine, memory at both ends. Since the start: costs, us."""
+        """Share of a core, ticks, missed ticks, those held up by the machine and memory at both ends, from the time when
+        memory has settled to the last sample; and costs since the start, us."""
         # Before the figures themselves take memory: 48 bytes a tick.
         resident = [self._settled_KiB, resident_KiB()]
         (begin, used, ticks, missed, held), end = self._begun, self._ended if self._used else self._counts()
@@ -172,7 +172,7 @@ def main() -> None:
     realtime = setup.configuration.realtime
     measures = list(set_up(realtime.lock_memory, realtime.fifo_priority, realtime.cpu))
     settle_memory()
-    # With what a process took that compiled beside this one.
+    # Including the CPU time of a process that compiled beside this one.
     print("ready", sum(os.times()[:4]), flush=True)
     daemon.run()
     gc.enable()

@@ -1,4 +1,4 @@
-"""What fields of a YAML file's structs are made of."""
+"""Types of the fields of structs that are read from YAML files."""
 
 from typing import Annotated
 

@@ -12,11 +12,17 @@ import yaml
 from emb_daemon.atomic import write_atomically
 from emb_daemon.calibration.strict_yaml import is_not_plain_text, load_yaml
 from emb_daemon.calibration.types import Calibration
+from emb_daemon.resources import resource
 
 
 def load_calibration(path: Path) -> Calibration:
     """Read a calibration. Raises InputErrors: every fault with file, line and key."""
     return load_yaml(Path(path), Calibration)
+
+
+def shipped_calibration() -> Calibration:
+    """The calibration that ships with the package: that of a simulated rig, for first experiments."""
+    return load_calibration(resource("config/calibration.yaml"))
 
 
 def calibration_hash(calibration: Calibration) -> str:

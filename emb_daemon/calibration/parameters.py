@@ -31,7 +31,7 @@ CLEARANCE, CLEARANCE_SIGMA = "contact.clearance_rad", "contact.clearance_sigma_r
 #: both far below the residuals of a fit, and few samples cross a switch such as contact or a reversal.
 _STEP = 1e-3
 
-#: What following the path of no number raises.
+#: Exceptions of following a path that leads to no number.
 _NO_NUMBER = (AttributeError, IndexError, KeyError, TypeError)
 
 #: Units of keys, by the ending that states them.
@@ -100,7 +100,7 @@ class Parameter:
 
 
 def parameter(calibration: Calibration, key: str) -> Parameter:
-    """What is known of a key. Raises InputError: no number has that key; names near ones."""
+    """The parameter that a key names. Raises InputError: no number has that key; names near ones."""
     value = value_of(calibration, key)
     parts = _parts(key)
     if parts[0] == "effects":

@@ -106,7 +106,7 @@ class Term(Struct, kw_only=True):
 
     @property
     def unit(self) -> str:
-        """Of the coefficient."""
+        """Unit of the coefficient."""
         return HOOKS[self.port].unit
 
     @property

@@ -1,6 +1,8 @@
 """emb-daemon check."""
 
 import argparse
+from collections.abc import Callable
+from pathlib import Path
 
 from emb_daemon.cli.options import add_mapping_argument, add_path, open_mapping
 from emb_daemon.errors import InputError, InputErrors
@@ -19,13 +21,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not arguments.config and not arguments.mapping:
         raise InputError("check: expected --config FILE, --mapping FILE or both")
-    faults, checked = [], {}
-    for path, check in ((arguments.mapping, open_mapping), (arguments.config, Setup)):
+    faults: list[str] = []
+
+    def check(load: Callable, path: Path | None):
         try:
-            checked[check] = check(path) if path else None
+            return load(path) if path else None
         except InputError as error:
-            faults += error.faults
-    mapping, setup = checked.get(open_mapping), checked.get(Setup)
+            faults.extend(error.faults)
+
+    mapping, setup = check(open_mapping, arguments.mapping), check(Setup, arguments.config)
     if mapping and setup:
         faults += mapping.taken(setup.layout)
     if faults:

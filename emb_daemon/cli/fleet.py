@@ -5,10 +5,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from emb_daemon.cli.options import CALIBRATION_HELP, add_mapping_argument, add_path, check_output
+from emb_daemon.cli.options import CALIBRATION_HELP, add_mapping_argument, add_path, check_output, load_chosen
 from emb_daemon.cli.progress import progress
 from emb_daemon.errors import InputError, tell
-from emb_daemon.resources import resource
 
 EXAMPLE = """emb-daemon fleet ingest logs/ --output fleet
   emb-daemon fleet diagnose fleet --units units.csv
@@ -55,12 +54,6 @@ def run(arguments: argparse.Namespace) -> int:
     return _COMMANDS[arguments.fleet_command][0](arguments)
 
 
-def _calibration(arguments: argparse.Namespace):
-    from emb_daemon.calibration.files import load_calibration
-
-    return load_calibration(arguments.calibration or resource("config/calibration.yaml"))
-
-
 def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list, failed: Callable | None = None) -> list:
     """``task`` of every item on the cluster, with a bar on a terminal."""
     from emb_daemon.fleet.cluster import cluster
@@ -92,7 +85,7 @@ def _ingest(arguments: argparse.Namespace) -> int:
 def _replay(arguments: argparse.Namespace) -> int:
     from emb_daemon.fleet import dataset, replaying
 
-    root, calibration = arguments.data.absolute(), _calibration(arguments)
+    root, calibration = arguments.data.absolute(), load_chosen(arguments.calibration)
     drives, makers = dataset.drives(root), dataset.made_by(calibration)
     left = [d for d in drives if not (arguments.resume and replaying.is_replayed(root, d, makers))]
     done = _work(arguments, "replaying", partial(replaying.replay_drive, root, calibration=calibration), left, _fault)
@@ -116,7 +109,7 @@ def _diagnose(arguments: argparse.Namespace) -> int:
     from emb_daemon.calibration.files import calibration_hash
     from emb_daemon.fleet import dataset, findings, scores
 
-    root, calibration = arguments.data.absolute(), _calibration(arguments)
+    root, calibration = arguments.data.absolute(), load_chosen(arguments.calibration)
     factors = findings.read_units(arguments.units) if arguments.units else {}
     groups = list(dataset.by_unit(dataset.drives(root)).values())
     task = partial(scores.score_unit, root, calibration=calibration, resume=arguments.resume)
@@ -155,7 +148,7 @@ def _report(arguments: argparse.Namespace) -> int:
 def _learn(arguments: argparse.Namespace) -> int:
     from emb_daemon.fleet import dataset, learning
 
-    root, calibration = arguments.data.absolute(), _calibration(arguments)
+    root, calibration = arguments.data.absolute(), load_chosen(arguments.calibration)
     groups = list(dataset.by_unit(dataset.drives(root)).values())
     task = partial(learning.learn_unit, root, calibration=calibration, resume=arguments.resume)
     done = _work(arguments, "learning", task, groups, _fault)
@@ -170,7 +163,7 @@ def _prior(arguments: argparse.Namespace) -> int:
     from emb_daemon.fleet.learning import prior
 
     check_output(arguments.output, (arguments.calibration,), (".yaml",))
-    calibration, told = prior(arguments.data.absolute(), _calibration(arguments))
+    calibration, told = prior(arguments.data.absolute(), load_chosen(arguments.calibration))
     save_calibration(calibration, arguments.output)
     for key, (mean, sigma, spread, units) in told.items():
         print(f"{key}: {mean:.6g} ± {sigma:.2g}, spread {spread:.2g} over {units} units")

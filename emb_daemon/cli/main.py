@@ -46,13 +46,13 @@ _NEED = {"demo": ("matplotlib",), "identify": ("scipy", "plotly"), "diagnose": (
 _WITHOUT_NUMBA = ("run", "check", "files", "monitor", "uds", "xcp", "a2l", "adaptation")
 
 
-def _parser(commands: dict[str, str]) -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="emb-daemon", description="Virtual clamp force sensor for electro-mechanical brakes."
     )
     parser.add_argument("--version", action="version", version=f"emb-daemon {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for name, summary in commands.items():
+    for name, summary in COMMANDS.items():
         subparsers.add_parser(name, help=summary, add_help=False)
     return parser
 
@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
         # Characters that the terminal's encoding lacks are replaced; they must not end the program.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    command = _parser(COMMANDS).parse_known_args(argv[:1])[0].command
+    command = _parser().parse_known_args(argv[:1])[0].command
     if own_process and command not in _WITHOUT_NUMBA:
         # Elsewhere python-can may be wanted for MDF4 by who calls.
         importlib.import_module("emb_daemon.wire.light_can")

@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         bus.close()
     if arguments.json:
-        json.dump({"corners": {corner.name: corner.state(now) for corner in listener.heard}}, sys.stdout, indent=1)
+        json.dump({"corners": listener.states(now)}, sys.stdout, indent=1)
         print()
     else:
         from emb_daemon.monitor.view import summary
@@ -73,7 +73,7 @@ def _check(arguments: argparse.Namespace, handed_out: bool) -> None:
 
 
 def _open_bus(arguments: argparse.Namespace, options: dict):
-    from emb_daemon.monitor.listener import Listener
+    from emb_daemon.monitor.listener import broadcast_ids
     from emb_daemon.runtime.bus import open_bus
 
     if arguments.mapping:
@@ -81,8 +81,8 @@ def _open_bus(arguments: argparse.Namespace, options: dict):
         from emb_daemon.logs.mapping import Mapping
 
         mapping = Mapping(arguments.mapping)
-        return ReferenceBus(open_buses(options, mapping), mapping, Listener().ids)
-    return open_bus(**options, ids=Listener().ids)
+        return ReferenceBus(open_buses(options, mapping), mapping, broadcast_ids())
+    return open_bus(**options, ids=broadcast_ids())
 
 
 def _hand_out(arguments: argparse.Namespace, bus, title: str) -> None:

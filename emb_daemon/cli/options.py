@@ -11,6 +11,7 @@ from emb_daemon.errors import InputError, tell
 
 if TYPE_CHECKING:
     from emb_daemon.calibration.configuration import Bus
+    from emb_daemon.calibration.types import Calibration
     from emb_daemon.logs.mapping import Mapping
 
 #: Help text of --config where it is the daemon's, and of --calibration where it may be left out.
@@ -28,6 +29,13 @@ def add_share_argument(parser: argparse.ArgumentParser) -> None:
     default = "/run/emb_daemon/estimates"
     text = f"the file given to emb-daemon run as --share (default: {default}, the service's)"
     add_path(parser, "--share", text, default=Path(default))
+
+
+def load_chosen(calibration: Path | None) -> "Calibration":
+    """The calibration that --calibration names, or the shipped one. Raises InputErrors: it is faulty."""
+    from emb_daemon.calibration.files import load_calibration, shipped_calibration
+
+    return load_calibration(calibration) if calibration else shipped_calibration()
 
 
 def check_output(path: Path, inputs: Iterable[Path | None], endings: tuple[str, ...] = ()) -> None:

@@ -5,10 +5,17 @@ import json
 import sys
 from pathlib import Path
 
-from emb_daemon.cli.options import CALIBRATION_HELP, LOG_HELP, add_mapping_argument, add_path, check_output, log_reader
+from emb_daemon.cli.options import (
+    CALIBRATION_HELP,
+    LOG_HELP,
+    add_mapping_argument,
+    add_path,
+    check_output,
+    load_chosen,
+    log_reader,
+)
 from emb_daemon.errors import InputError, tell
 from emb_daemon.estimator.status import TABLE
-from emb_daemon.resources import resource
 
 #: Least share of a log's samples for a reason or fact in the summary; tables contain all reasons.
 _LEAST_SHARE = 0.001
@@ -20,11 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_path(parser, "--calibration", CALIBRATION_HELP)
     add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL), or all: every corner in the log")
-    for option, default, help in (
-        ("--from", 0.0, "give results from this time on"),
-        ("--to", float("inf"), "stop at this time"),
+    for option, name, default, help in (
+        ("--from", "start_s", 0.0, "give results from this time on"),
+        ("--to", "end_s", float("inf"), "stop at this time"),
     ):
-        parser.add_argument(option, type=float, default=default, metavar="S", help=f"{help}, seconds of each log")
+        help += ", seconds of each log"
+        parser.add_argument(option, dest=name, type=float, default=default, metavar="S", help=help)
     parser.add_argument(
         "--pad-thickness", type=float, metavar="MM", help="thickness of the mounted pads, if not that of the calibration"
     )
@@ -47,11 +55,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     _check(arguments)
     calibration = _calibration(arguments)
-    read, window = log_reader(arguments.mapping), (getattr(arguments, "from"), arguments.to)
-    sign = np.asarray
+    read, sign = log_reader(arguments.mapping), np.asarray
     if arguments.keys:
         read, sign = _secure(arguments, read)
-    replay = Replay(calibration, arguments.corner, arguments.measured_torque, arguments.state, read, *window)
+    replay = Replay(
+        calibration, arguments.corner, arguments.measured_torque, arguments.state, read, arguments.start_s, arguments.end_s
+    )
     if arguments.output and ending_of(arguments.output) in FRAME_ENDINGS:
         write_frames(
             arguments.output, np.concatenate([sign(part).copy() for log in arguments.logs for part in replay.frames(log)])
@@ -69,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         _write_table(arguments.output, results)
     if arguments.report:
         _write_report(arguments, results, replay.corners[0], calibration)
-    report = [result.figures() for result in results]
+    report = [result.figures for result in results]
     if arguments.json:
         json.dump({"logs": report}, sys.stdout, indent=1)
         print()
@@ -81,10 +90,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _calibration(arguments: argparse.Namespace):
     """The calibration with the pads that are mounted; prints to stderr if it is none of this brake, or of a brake at all."""
-    from emb_daemon.calibration.files import load_calibration
     from emb_daemon.calibration.parameters import moved
 
-    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+    calibration = load_chosen(arguments.calibration)
     if arguments.pad_thickness is not None:
         calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
     if not calibration.contact.is_in_reach:
@@ -135,10 +143,9 @@ def _check(arguments: argparse.Namespace) -> None:
     from emb_daemon.replay import ALL
 
     output, report = arguments.output, arguments.report
-    if not 0.0 <= getattr(arguments, "from") < arguments.to:
-        raise InputError(
-            f"--from {getattr(arguments, 'from'):g} --to {arguments.to:g}: expected 0 or more, and --to after --from"
-        )
+    start_s, end_s = arguments.start_s, arguments.end_s
+    if not 0.0 <= start_s < end_s:
+        raise InputError(f"--from {start_s:g} --to {end_s:g}: expected 0 or more, and --to after --from")
     inputs = (*arguments.logs, arguments.calibration, arguments.mapping)
     if output:
         check_output(output, inputs, TABLE_ENDINGS + FRAME_ENDINGS)

@@ -2,10 +2,9 @@
 
 import argparse
 
-from emb_daemon.cli.options import add_bus_arguments, add_mapping_argument, add_path, bus_options
+from emb_daemon.cli.options import add_bus_arguments, add_mapping_argument, add_path, bus_options, load_chosen
 from emb_daemon.cli.serving import stop_signals
 from emb_daemon.errors import InputError
-from emb_daemon.resources import resource
 
 EXAMPLE = "emb-daemon simulate -i socketcan -c vcan0 --corners 4 --scenario drive"
 
@@ -26,7 +25,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from emb_daemon.calibration.files import load_calibration
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
     from emb_daemon.plant.live import LiveCar
@@ -37,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.scenario not in SCENARIOS:
         raise InputError(f"--scenario {arguments.scenario}: expected {' or '.join(SCENARIOS)}")
     schedule = SCENARIOS[arguments.scenario]()
-    calibration = load_calibration(arguments.calibration or resource("config/calibration.yaml"))
+    calibration = load_chosen(arguments.calibration)
     corners = CORNERS[: arguments.corners]
     plants = np.array([plant_from_calibration(calibration, arguments.seed + row) for row in range(len(corners))])
     bus = _open_bus(arguments, corners)
@@ -65,13 +63,13 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _open_bus(arguments: argparse.Namespace, corners: tuple[str, ...]):
+    from emb_daemon.monitor.listener import broadcast_ids
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.wire.keys import load_keys
-    from emb_daemon.wire.layout import default_layout
     from emb_daemon.wire.secoc import load_links
 
     # The daemon's broadcasts, although the car itself reacts to EMB_c_AdaptRequest only.
-    ids = [int(can_id) for can_id in default_layout()["sent_id"].ravel()]
+    ids = broadcast_ids()
     sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
     ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
     if arguments.mapping:

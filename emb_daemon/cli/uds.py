@@ -31,12 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.adapt.memory import state_directory
     from emb_daemon.calibration.configuration import Setup
-    from emb_daemon.monitor.listener import Listener
+    from emb_daemon.monitor.listener import broadcast_ids
     from emb_daemon.runtime.bus import open_bus
     from emb_daemon.workshop.serve import Diagnostics
 
     configuration = Setup(arguments.config).configuration
-    listened = Listener().ids
+    listened = broadcast_ids()
     check_ids(arguments, listened)
     state = arguments.state or state_directory(configuration.state_directory or "/var/lib/emb_daemon", arguments.config.parent)
     if not state.is_dir():

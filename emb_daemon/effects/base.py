@@ -21,8 +21,8 @@ class Hook:
             are in SI units.
         path: ``stiffness``, ``torque`` or ``thermal``.
         channel: residual in which a change of the quantity shows.
-        like: base parameter (key of the calibration) that changes the same quantity, or None: its regressor times a signal is
-            what any function of that signal would do here.
+        like: base parameter (key of the calibration) that changes the same quantity, or None. The regressor of a function of
+            a signal at this hook is that of the parameter, times the function.
     """
 
     unit: str
@@ -35,7 +35,7 @@ class Hook:
 
 _GEAR = ("angle", "travel", "mean_speed", "friction_mean", "past_contact", "force", "dt")
 
-#: By name, in the order in which a sample passes through them.
+#: Hooks by name, in the order in which a sample passes through them.
 HOOKS = {
     # Growth of disc and pads since power-on, along the pads' travel.
     "thickness": Hook(
@@ -109,7 +109,7 @@ class Parameter:
     group: str = ""
 
     def bounds(self, clamps: bool) -> tuple[float, float]:
-        """What a calibration may hold, of an actuator that ``clamps`` or of any other machine."""
+        """Least and largest value in a calibration: of an actuator that ``clamps``, or of any other machine."""
         if clamps or self.unit not in OF_THE_MOTOR:
             return self.low, self.high
         return (-np.inf if self.low < 0.0 else self.low), np.inf

@@ -100,7 +100,7 @@ def backplates(e: Record, s: Record, inner: float, outer: float, dt: float) -> t
 
 @njit
 def heat_balance(e: Record, s: Record, dt: float) -> Altered:
-    """What effects make of the heat balance over ``dt`` seconds."""
+    """How effects alter the heat balance over ``dt`` seconds."""
     return Altered(
         max(_heat_share(e, s, dt), _LEAST),
         max(_contact_conductance(e, s, dt), _LEAST),

@@ -46,7 +46,7 @@ SIGNALS = {
 #: Memory of a term's signal x: none; lag: z of τ dz/dt + z = x; deficit: z − x; slip: a Maxwell slip element of stretch
 #: ``memory_scale``, z in [-1, 1]; response: the same lag, of the output of the shape.
 MEMORIES = ("none", "lag", "deficit", "slip", "response")
-#: Of u = (z − centre)/scale: 1; sign(u)|u|^n; |u|^n; u/(1 + |u|); exp(−|u|); max(u, 0); c cos u + d sin u; exp(−u²).
+#: Functions of u = (z − centre)/scale: 1; sign(u)|u|^n; |u|^n; u/(1 + |u|); exp(−|u|); max(u, 0); c cos u + d sin u; exp(−u²).
 SHAPES = ("constant", "odd_power", "even_power", "saturation", "decay", "onset", "harmonic", "bump")
 #: When a term acts; ``load`` multiplies it by the clamp force over the largest.
 GATES = ("always", "load", "closing", "opening", "turning", "standing")

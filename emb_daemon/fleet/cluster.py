@@ -8,6 +8,7 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from emb_daemon.errors import InputError, Unavailable
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
 _LIVES = 3
 #: Tasks that the scheduler holds per worker: enough that no worker waits for the client, few enough for 10⁷ logs.
 _AHEAD = 20
-#: Time without an answer after which a scheduler counts as missing, s; and how often as long no worker may be there: starting
-#: one again takes some seconds.
+#: Time without an answer after which a scheduler counts as missing, s; and number of such times without any worker after which
+#: the work ends: starting one again takes some seconds.
 _PATIENCE_S, _WITHOUT_WORKERS = 10, 6
-#: Settings of Dask. A task takes seconds: scheduler and two workers that watch themselves up to a hundred times a second take
-#: a sixth of a core with nothing to do.
+#: Settings of Dask for tasks of seconds: a scheduler and two workers that watch themselves up to a hundred times a second use
+#: a sixth of a core while they are idle.
 _SETTINGS = {
     "distributed.admin.large-graph-warning-threshold": "1GB",
     "distributed.admin.tick.interval": "500ms",
@@ -48,7 +49,7 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
     """
     # One thread each: a worker uses one core, and BLAS must not start more threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Arrow's own allocator keeps what the largest drive took.
+    # Arrow's own allocator would keep the memory that the largest drive took.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     import dask
     from distributed import Client, LocalCluster
@@ -82,8 +83,8 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
                     with contextlib.suppress(TimeoutError):
                         client.wait_for_workers(count, timeout=_PATIENCE_S)
         finally:
-            # What the work gave is in files; a worker that could not be closed, or of whose start distributed had not heard
-            # when it died, ends with this process.
+            # Results are in files. A worker that could not be closed, or that died before distributed had heard of its start,
+            # ends with this process.
             with contextlib.suppress(AssertionError, KeyError):
                 local.close()
 
@@ -131,15 +132,10 @@ def run(
     results: list = [None] * len(items)
     suspects: list[int] = []
     done = 0
-    waiting = iter(enumerate(items))
-    row_of: dict = {}
 
-    def submit() -> Any:
-        for row, item in waiting:
-            future = client.submit(task, item, pure=False)
-            row_of[future.key] = row
-            return future
-        return None
+    def submit(rows: Iterable[int]) -> dict[Any, int]:
+        """Rows by the futures of their tasks."""
+        return {client.submit(task, items[row], pure=False): row for row in rows}
 
     def settle(row: int, future: Any, final: tuple[type[Exception], ...]) -> None:
         nonlocal done
@@ -160,16 +156,15 @@ def run(
         progress(done, len(items))
 
     ahead = _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    running = {future for future in (submit() for _ in range(min(ahead, len(items)))) if future}
+    waiting = iter(range(len(items)))
+    running = submit(islice(waiting, ahead))
     while running:
         for future in _first_done(client, running):
-            running.remove(future)
-            settle(row_of.pop(future.key), future, (InputError,))
-            if (following := submit()) is not None:
-                running.add(following)
+            settle(running.pop(future), future, (InputError,))
+            running |= submit(islice(waiting, 1))
     # Dask blames a worker's death on every task that was there. Each is repeated alone to find the one that kills a worker.
     for row in suspects:
-        future = client.submit(task, items[row], pure=False)
-        _first_done(client, [future])
-        settle(row, future, (InputError, KilledWorker))
+        alone = submit([row])
+        for future in _first_done(client, alone):
+            settle(row, future, (InputError, KilledWorker))
     return results

@@ -39,7 +39,7 @@ _FORMAT, _KEY = 1, b"emb_daemon"
 #: Rows that are read at once.
 _ROWS = 1 << 14
 _FORCE = "clamp_force_ref_N"
-#: Columns that data sets of format 1 need not have: those of before force sensors were read. Zero says that none was heard.
+#: Columns that a data set of format 1 may lack, because it is older than the reading of force sensors. Zero: none was heard.
 _OPTIONAL = {"sensor_force", "has_sensor_force"}
 
 
@@ -72,13 +72,13 @@ class About:
     notes: str
 
 
-#: Of the sources that compiled code is made of, as they were when the process began.
+#: Digest of the sources of compiled code, as they were when the process began.
 _kernels = cache(installed_digest)
 
 
 def made_by(calibration: Calibration) -> str:
-    """What makes a result from a drive: a calibration and an estimator, by their hashes. Results that others made are made
-    anew, or an update would look like a change of the fleet on its day."""
+    """What a result is computed with, the calibration and the estimator, by their hashes. A result of others is computed anew,
+    or an update would look like a change of the fleet on its day."""
     return f"{calibration_hash(calibration)} {_kernels()}"
 
 

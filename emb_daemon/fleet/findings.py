@@ -214,7 +214,7 @@ class _Study:
         if slopes and np.isfinite(warmth).all() and np.ptp(warmth) >= _LEAST_K:
             self.covariates.append("warmth")
         columns = [self._columns(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
-        #: By covariate, the directions in which units may differ.
+        #: The directions in which units may differ, by covariate.
         self.free = [np.eye(self.directions.basis.shape[1])]
         self.free += [changing(self.scores, self.directions, slope) for slope in zip(*(c.T[1:] for c in columns), strict=True)]
         self.units = [unit_of(s, self.directions, c, self.free) for s, c in zip(self.scores, columns, strict=True)]
@@ -223,7 +223,7 @@ class _Study:
         self.levels = {"corner": np.array([corner for _, corner in self.keys])}
         self.levels |= {name: np.array([factors.get(unit, {}).get(name, "") for unit, _ in self.keys]) for name in named}
         self.levels = {name: levels for name, levels in self.levels.items() if len(set(levels.tolist())) > 1}
-        # Of all factors except the corner, whose difference is by design.
+        # Groups of all factors except the corner, whose difference is by design.
         self.groups = {
             f"{name} {level}": levels == level
             for name, levels in self.levels.items() if name != "corner"
@@ -257,8 +257,8 @@ class _Study:
         ageing: list[Finding] = []
         for name in self.covariates[1:]:
             slopes, uneven, own = self.read(name)
-            # The season of a cause that acts by temperature would be the curvature of its law, for which a misfit of the
-            # model's heat passes. It is alike in all units: more of them are only surer of it, and no batch shows it.
+            # The season of a cause that acts by a temperature would be the curvature of its law, and a misfit of the heat
+            # model looks like it. It is the same in all units: more of them only make it more significant; no batch shows it.
             thermal = [row for row, cause in enumerate(self.causes) if cause.thermal and name == "warmth"]
             shared = shared_causes(slopes, {ALL: self.masks[ALL]}, own, beside=False, misfits=thermal)
             shared += shared_causes(slopes, self.groups, own, beside=True)

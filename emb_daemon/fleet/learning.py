@@ -1,4 +1,4 @@
-"""What adaptation learns of each unit over its drives, and a calibration for the next unit from all of them."""
+"""Runs adaptation over all drives of each unit, and makes a calibration for the next unit from what they learned."""
 
 import json
 import tempfile

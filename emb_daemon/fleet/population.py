@@ -19,7 +19,7 @@ from emb_daemon.fleet.scores import Score
 
 #: Directions whose information is below this share of the strongest one's are dominated by rounding and curvature.
 _TOLD_APART = 1e-5
-#: Share of a slope's information that free levels must leave: of what no cause explains, a slope then takes at most double.
+#: Least share of a slope's information that is left where levels are free too: the error of the slope then at most doubles.
 _SLOPE = 0.25
 #: Information, as a share of the drives', with which a direction is drawn to zero.
 _HELD = 0.01
@@ -99,7 +99,7 @@ def changing(units: Sequence[Sequence[Score]], directions: Directions, covariate
         both = np.einsum("d,dab->ab", own, information)
         left = left + np.einsum("d,dab->ab", own**2, information) - both @ np.linalg.solve(level, both)
         square += float(own @ own)
-    # Of an average drive the information is one in each direction.
+    # The basis is scaled: an average drive's information is one in each direction.
     share, vectors = np.linalg.eigh(left / square)
     return vectors[:, share >= _SLOPE]
 
@@ -375,7 +375,8 @@ class RandomEffects:
 
 
 def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
-    """Of units' values with their own standard deviations, shape (N,), by Paule and Mandel (J. Research NBS 87, 1982)."""
+    """Mean and spread of units whose values, shape (N,), have standard deviations of their own, by Paule and Mandel (J.
+    Research NBS 87, 1982)."""
     from scipy.optimize import brentq
 
     def excess(share: float) -> float:

@@ -29,7 +29,7 @@ def replay_drive(root: Path, drive: Drive, calibration: Calibration) -> dict[str
     log, about = read_drive(root, drive)
     estimates = estimate(log.samples, to_parameters(calibration))
     result = Result(log.path, log.time_ns, estimates, log.samples, log.reference, log.force_N)
-    figures = result.figures() | {"log": about.source, "refused": about.refused, "notes": about.notes}
+    figures = result.figures | {"log": about.source, "refused": about.refused, "notes": about.notes}
     figures["made_by"] = made_by(calibration)
     columns = table_columns(estimates, 1e-9 * log.time_ns) | reference_columns(log.reference, log.time_ns, log.force_N)
     # A worker does not hold a long drive's samples while its columns are written.

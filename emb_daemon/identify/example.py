@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon.atomic import write_atomically
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.errors import InputError
 from emb_daemon.offline import log_of
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import Schedule, curve, random_angle, rest, simulate_log, stop
-from emb_daemon.resources import resource
 from emb_daemon.wire.layout import load_database
 
 #: Where DBC, mapping, campaign and datasheet are.
@@ -26,7 +25,7 @@ def write_example(folder: Path) -> list[Path]:
     files = sorted(FILES.iterdir())
     for file in files:
         write_atomically(folder / file.name, file.read_bytes())
-    plant = plant_from_calibration(load_calibration(resource("config/calibration.yaml")), seed=7)
+    plant = plant_from_calibration(shipped_calibration(), seed=7)
     rng = np.random.default_rng(7)
     motions = {
         "slow": rest(0.5) + curve(plant, seconds=24.0),

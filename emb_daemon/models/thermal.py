@@ -29,7 +29,7 @@ LONGEST_S = 0.25
 
 
 class Altered(NamedTuple):
-    """What effects make of the heat balance: factors, and heat (W) that flows beside it.
+    """How effects alter the heat balance: factors, and heat (W) that flows beside it.
 
     Attributes:
         heat_share: on the share of the friction power that goes into the pads; the disc gets the rest.

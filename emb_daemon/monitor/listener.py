@@ -184,6 +184,11 @@ def _word(words: Sequence[str] | Mapping[int, str], stream: Stream, column: int)
     return known.get(int(stream.values[column]), "?")
 
 
+def broadcast_ids() -> list[int]:
+    """CAN ids of a daemon's broadcasts, of all corners."""
+    return default_layout()["sent_id"].ravel().tolist()
+
+
 class Listener:
     """All corners' broadcasts, and RIG_c_Force of `logs.live.ReferenceBus`. `hear` takes FRAME arrays as a bus returns them,
     with times on the monotonic clock."""
@@ -202,13 +207,13 @@ class Listener:
         self.reset()
 
     @property
-    def ids(self) -> list[int]:
-        return list(self._place)
-
-    @property
     def heard(self) -> list[Corner]:
         """The corners from which broadcasts were received."""
         return [corner for corner in self.corners if corner.heard]
+
+    def states(self, now_ns: int) -> dict[str, dict[str, Any]]:
+        """`Corner.state` of each corner from which broadcasts were received, by name."""
+        return {corner.name: corner.state(now_ns) for corner in self.heard}
 
     def reset(self) -> None:
         """Forget everything."""

@@ -43,7 +43,7 @@ def _family(name: str, kind: str, about: str, rows: Iterable[tuple[str, float | 
 
 def exposition(listener: Listener, now_ns: int) -> str:
     """Every corner from which broadcasts were received, at a time on the monotonic clock."""
-    states = [(f'corner="{corner.name}"', corner.state(now_ns)) for corner in listener.heard]
+    states = [(f'corner="{name}"', state) for name, state in listener.states(now_ns).items()]
     lines: list[str] = []
     for name, (about, value) in _GAUGES.items():
         lines += _family(name, "gauge", about, ((corner, value(state)) for corner, state in states))

@@ -4,7 +4,7 @@ import json
 import time
 from pathlib import Path
 
-from emb_daemon.monitor.listener import Corner, Listener
+from emb_daemon.monitor.listener import Listener
 
 #: Bytes after which a chunk is written: at most some seconds of four corners are lost if the recorder is killed.
 _CHUNK = 1 << 16
@@ -35,21 +35,20 @@ class Recording:
     def show(self, listener: Listener, now_ns: int) -> None:
         """Write each corner from which something new was received; times on the machine's clock."""
         stamp = time.time_ns()
-        for corner in listener.heard:
-            state = corner.state(now_ns)
-            if self._received.get(corner.name) != state["received"]:
-                self._received[corner.name] = state["received"]
-                self._writer.add_message(self._channel(corner, state), stamp, json.dumps(state).encode(), stamp)
+        for name, state in listener.states(now_ns).items():
+            if self._received.get(name) != state["received"]:
+                self._received[name] = state["received"]
+                self._writer.add_message(self._channel(name, state), stamp, json.dumps(state).encode(), stamp)
 
-    def _channel(self, corner: Corner, state: dict) -> int:
-        if corner.name not in self._channels:
-            words = {name: value or "" for name, value in state.items() if name in ("status", "source", "mode")}
+    def _channel(self, corner: str, state: dict) -> int:
+        if corner not in self._channels:
+            words = {name: state[name] or "" for name in ("status", "source", "mode")}
             words |= {"facts": [], "adaptation": {"request": "", "progress_percent": 0, "result": ""}}
             schema = self._writer.register_schema(
                 "emb_daemon.Corner", "jsonschema", json.dumps(_schema(state | words)).encode()
             )
-            self._channels[corner.name] = self._writer.register_channel(f"/{corner.name}", "json", schema)
-        return self._channels[corner.name]
+            self._channels[corner] = self._writer.register_channel(f"/{corner}", "json", schema)
+        return self._channels[corner]
 
     def close(self) -> None:
         self._writer.finish()

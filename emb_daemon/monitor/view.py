@@ -120,15 +120,12 @@ def render(listener: Listener, now_ns: int, title: str, width: int, height: int,
 def summary(listener: Listener, now_ns: int) -> list[str]:
     """One line for each corner, for output that is not a terminal."""
     lines = []
-    for corner in listener.heard:
-        state = corner.state(now_ns)
+    for name, state in listener.states(now_ns).items():
         force, sigma = number(state["clamp_force_kN"], 3), number(state["clamp_force_sigma_kN"], 3)
         pads = f"pads {number(state['inner_surface_C'], 0)} and {number(state['outer_surface_C'], 0)} °C"
         counts = f"{state['forces_per_s']:.0f}/s, {state['missing']} missing, {state['damaged']} damaged"
         reasons = f"; {', '.join(state['reasons'])}" if state["reasons"] else ""
         reference = state["clamp_force_ref_kN"]
         sensor = "" if reference is None else f" (reference {number(reference, 3)} kN)"
-        lines.append(
-            f"{corner.name} {force} ± {sigma} kN{sensor} {state['source']}, {state['mode']}, {pads}, {counts}{reasons}"
-        )
+        lines.append(f"{name} {force} ± {sigma} kN{sensor} {state['source']}, {state['mode']}, {pads}, {counts}{reasons}")
     return lines

@@ -28,7 +28,7 @@ _HISTORY = round(HISTORY_S / _SHOW_S)
 
 def state(listener: Listener, now_ns: int) -> dict[str, Any]:
     """State of all corners; times in s, on the machine's clock."""
-    return {"timestamp": time.time(), "corners": {corner.name: corner.state(now_ns) for corner in listener.heard}}
+    return {"timestamp": time.time(), "corners": listener.states(now_ns)}
 
 
 def _forces(said: dict) -> list:

@@ -173,7 +173,7 @@ class _Problem:
         return dict(zip(self.keys, values.tolist(), strict=True))
 
     def residuals(self, x):
-        """By block; ``x`` is the searched vector as a tuple, here and in `derivatives`."""
+        """Residuals of each block; ``x`` is the searched vector as a tuple, here and in `derivatives`."""
         values = self.values(x)
         return list(self.map(lambda block: block.residual(values), self.blocks))
 
@@ -217,7 +217,7 @@ class _Problem:
         return jacobian - (2.0 / length) * np.outer(mirror, mirror @ jacobian) if length > 0.0 else jacobian
 
     def covariance(self, x):
-        """Of the searched vector; and the prior's share of each parameter's information."""
+        """Covariance of the searched vector, and the prior's share of each parameter's information."""
         count = len(x)
         prior = np.diag(self.weight**2)
         normals, scores = [], []

@@ -132,7 +132,7 @@ class EpisodeErrors:
 
     @classmethod
     def of(cls, errors: dict[str, np.ndarray], masks: dict[str, np.ndarray], episode: np.ndarray) -> "EpisodeErrors":
-        """From errors by path and masks by condition over the rows of one log; ``episode`` counts from 0, shape (n,)."""
+        """Sums of one log, from errors by path and masks by condition over its rows; ``episode`` counts from 0, shape (n,)."""
         masks = masks | {"total": np.ones(len(episode), bool)}
         shape = (len(errors), len(masks), int(episode[-1]) + 1)
         sums, counts = np.zeros(shape), np.zeros(shape)
@@ -145,7 +145,7 @@ class EpisodeErrors:
 
     @classmethod
     def joined(cls, parts: list["EpisodeErrors"]) -> "EpisodeErrors":
-        """Of several logs with the same paths and conditions, one after the other."""
+        """The episodes of several logs with the same paths and conditions, one after the other."""
         sums, counts = (np.concatenate([getattr(part, name) for part in parts], axis=2) for name in ("sums", "counts"))
         return cls(parts[0].paths, parts[0].conditions, sums, counts)
 

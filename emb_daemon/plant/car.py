@@ -299,7 +299,7 @@ def _tick(w, rng, commands, drive, frames, truth):
     car.time_ns += CYCLE_NS
     car.tick += 1
     slow_reference = car.time_ns // _REFERENCE_SLOW_NS != (car.time_ns - CYCLE_NS) // _REFERENCE_SLOW_NS
-    # Of numpy: numba would compile what takes Python's zero apart from what takes any count.
+    # An integer of numpy: for Python's zero numba would compile the functions that take the count a second time.
     count = np.int64(0)
     for row in range(len(w.corners)):
         p, s, training, corner = w.plants[row], w.states[row], w.trainings[row], w.corners[row]

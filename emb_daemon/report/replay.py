@@ -206,7 +206,7 @@ def replay_page(
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
     time_s = 1e-9 * (estimates["time_ns"] - estimates["time_ns"][0])
-    by_log = [result.figures() for result in results]
+    by_log = [result.figures for result in results]
     page = Page(f"Replay, corner {corner}", f"{', '.join(result.path.name for result in results)} · emb-daemon {__version__}")
     flagged = float(np.mean(estimates["reasons"] != 0))
     details = [

@@ -24,7 +24,7 @@ _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
 
 
 class Bus(Protocol):
-    """What the loop, the monitor and the workshop's servers call; `RawCanSocket` and `PythonCanBus` say more of each.
+    """A bus as the loop, the monitor and the workshop's servers use it; `RawCanSocket` and `PythonCanBus` say more of each.
 
     Attributes:
         dropped, unsent: frames that the receiver had no room for, and that the bus did not accept.
@@ -46,7 +46,7 @@ class Bus(Protocol):
 
 
 class PythonCan(Protocol):
-    """What is called of a python-can bus."""
+    """The methods of a python-can bus that are used."""
 
     def fileno(self) -> int: ...
 

@@ -18,7 +18,7 @@ _WRITTEN, _SPAN_NS = 10, 10_000_000_000
 
 
 class ChangeLog:
-    """What was written of each corner.
+    """The journal's lines of each corner.
 
     Attributes:
         states: mode << 16 | reasons by corner, shape (4,), as they are now; -1 before the first estimate.

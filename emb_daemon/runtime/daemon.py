@@ -22,7 +22,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import ESTIMATE, STATE
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import Array, compile_beside, entry, njit
-from emb_daemon.pipeline import LATE_CYCLES, Pipeline
+from emb_daemon.pipeline import LATE_CYCLES, SHOWN_NS, Pipeline
 from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.changes import ChangeLog
 from emb_daemon.runtime.journal import log
@@ -43,8 +43,6 @@ _MARGIN_NS = 200_000
 QUEUED_NS = 1_000_000
 #: Samples expected within this time of each other are estimated in one tick.
 _TOGETHER_NS = 400_000
-#: Time for which a disturbance of bus or loop is reported with the estimates.
-_SHOWN_NS = 1_000_000_000
 _STATUS_NS = 10_000_000_000
 #: Time for which a page that was read waits until the car is seen at rest: reading may have delayed the loop's reception.
 _SETTLING_NS = 500_000_000
@@ -87,7 +85,7 @@ class Pacer:
 
 @entry(Array(ESTIMATE), int, Array(STATE), Array(RECEPTION), Array(np.int64), Array(np.int64), Array(np.int64), returns=3)
 def _scan(estimates, count, states, receptions, arrivals, reported, facts):
-    """What the loop needs to know of new estimates. Sets ``arrivals`` to the time at which each corner's sample was complete
+    """Scan new estimates for the loop. Sets ``arrivals`` to the time at which each corner's sample was complete
     (0: none), ``reported`` to mode and reasons, and ``facts`` to what the estimator found. Returns bit masks of corners:
     estimated; with a state that is not a number; with changed mode or reasons."""
     estimated, lost, changed = 0, 0, 0
@@ -165,7 +163,7 @@ class Daemon:
         self._on_page: set[str] = set()
         #: Calibrations by corner as last read from the files: those in use while there is no page.
         self._of_files = dict(setup.calibrations)
-        self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -_SHOWN_NS)
+        self._disturbed_ns = dict.fromkeys((contract.BUS_DISTURBED, contract.DEADLINE_MISSED), -SHOWN_NS)
         self._losses = (0, 0)
         self._changes = ChangeLog()
         self._arrivals = np.zeros(len(CORNERS), np.int64)
@@ -308,7 +306,7 @@ class Daemon:
             self._disturb(contract.DEADLINE_MISSED, now_ns)
 
     def _disturb(self, reason: int, now_ns: int) -> None:
-        if now_ns - self._disturbed_ns[reason] >= _SHOWN_NS:
+        if now_ns - self._disturbed_ns[reason] >= SHOWN_NS:
             log.warning("%s", contract.reason_words(reason)[0], extra={"fields": {"reason": reason}})
         self._disturbed_ns[reason] = now_ns
 
@@ -319,7 +317,7 @@ class Daemon:
             self._disturb(contract.BUS_DISTURBED, now_ns)
         bits = 0
         for reason, at in self._disturbed_ns.items():
-            if now_ns - at < _SHOWN_NS:
+            if now_ns - at < SHOWN_NS:
                 bits |= reason
         self.pipeline.disturbed[:] = bits
 

@@ -160,7 +160,7 @@ class RawCanSocket:
         return bool(select.select([self._socket], [], [], timeout_s)[0]) if timeout_s > 0 else False
 
     def drain(self) -> np.ndarray:
-        """All frames that have arrived, at most ``capacity``, as a FRAME array valid until the next call."""
+        """All frames that have arrived, at most `_CAPACITY`, as a FRAME array valid until the next call."""
         looked = time.monotonic_ns()
         if self._reopen_ns is not None and looked >= self._reopen_ns:
             self._rebind(looked)

@@ -27,7 +27,7 @@ _ROOM = 4096
 
 
 class Freshness(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What must survive a restart: the process's own trip counter, and the last (trip, reset) received, by link."""
+    """Counters that must survive a restart: the process's own trip counter, and the last (trip, reset) received, by link."""
 
     format: int = _FORMAT
     trip: Annotated[int, Meta(ge=0, le=LAST_TRIP)] = 0
@@ -135,7 +135,7 @@ class Authentication:
             self._writer.start()
 
     def _store(self, file: FreshnessFile, heard: Freshness) -> None:
-        """What could not be stored stays stale, and is tried again."""
+        """Counters that cannot be stored stay stale, and storing is tried again."""
         if file.keep(heard):
             self._kept = heard
 

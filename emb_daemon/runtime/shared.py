@@ -39,10 +39,10 @@ SHARED = np.dtype(
     ],
     align=True,
 )
-#: Age up to which a row is of the present, ns: that of the first of the three messages in a row by which a trouble code fails.
+#: Largest age of a row that counts as present, ns: that of the first of the three messages in a row that fail a trouble code.
 _PRESENT_NS = 300_000_000
-#: Looks without a row after which nobody is said to write any. It is no time: a reader of lowest priority may look seldom,
-#: and gets the first rows at its third look.
+#: Number of looks without a row after which no daemon counts as sharing. It is not a time, because a reader of lowest priority
+#: may look seldom; it gets the first rows at its third look.
 _LOOKS = 15
 #: Version of the records above, on which writer and reader must agree.
 LAYOUT_DIGEST = hashlib.sha256(repr((SHARED.descr, SHARED.itemsize)).encode()).hexdigest()[:16].encode()

@@ -20,7 +20,7 @@ _ADDED = 0x63
 
 @njit
 def _product(a3, a2, a1, a0, b3, b2, b1, b0):
-    """In GF(16)."""
+    """Product of two elements of GF(16), highest bit first."""
     p2, p1, p0 = (a3 ^ a2) & (b3 ^ b2), a3 & b3, a2 & b2
     q2, q1, q0 = (a1 ^ a0) & (b1 ^ b0), a1 & b1, a0 & b0
     a3, a2, b3, b2 = a3 ^ a1, a2 ^ a0, b3 ^ b1, b2 ^ b0
@@ -75,7 +75,7 @@ def _shift_rows(q):
 def _mix_columns(q):
     high = 0
     for i in range(8):
-        # Of each byte with the next one of its column, doubled: the bits move up by one word, the highest to where 0x1B has
+        # Each byte plus the next one of its column is doubled: the bits move up by one word, the highest to where 0x1B has
         # ones.
         a = int(q[i])
         next_one = a >> 1 & 0x7777 | a << 3 & 0x8888
@@ -103,7 +103,7 @@ def _encrypt(key):
 
 @njit
 def _transpose(x):
-    """Of eight bytes, bit i of byte n as bit n of byte i."""
+    """Transpose eight bytes: bit i of byte n becomes bit n of byte i."""
     swapped = (x ^ x >> 7) & 0x00AA00AA00AA00AA
     x ^= swapped ^ swapped << 7
     swapped = (x ^ x >> 14) & 0x0000CCCC0000CCCC
@@ -155,7 +155,7 @@ def _add_subkeys(key):
         for i in range(8):
             # The highest bit of the next byte becomes the lowest.
             key.last[which, i] = before[i - 1] if i > 0 else before[7] >> 1
-        # What leaves the block comes back as 0x87 in its last byte.
+        # A bit that leaves the block comes back as 0x87 in its last byte.
         for i in (0, 1, 2, 7):
             key.last[which, i] ^= (before[7] & 1) << 15
         for i in range(8):

@@ -43,7 +43,7 @@ _RECEIVED = {
     "EMB_{}_Thermocouple": (THERMOCOUPLE, ("InnerBackplateTemp", "OuterBackplateTemp", "CaliperTemp")),
     "EMB_{}_ForceSensor": (FORCE_SENSOR, ("SensorForce",)),
 }
-#: By the last word of its name: a message that a DBC may be without.
+#: Messages that a DBC may lack, by the last word of their names.
 OPTIONAL = ("ForceSensor",)
 _VEHICLE = {
     "VEH_WheelSpeed": (WHEEL_SPEED, tuple(f"WheelSpeed{c}" for c in CORNERS)),

@@ -1,7 +1,7 @@
-"""python-can as commands and workers import it: first, and without asammdf.
+"""Imports python-can without asammdf; commands and workers import this module first.
 
-It imports that wherever it is installed, and with it pandas: a third of a command's start-up time and 87 MiB, for files that
-are read in another process (`logs.apart`).
+python-can imports asammdf wherever it is installed, and with it pandas: a third of a command's start-up time and 87 MiB, for
+files that are read in another process (`logs.apart`).
 """
 
 import sys

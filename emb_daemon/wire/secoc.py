@@ -134,7 +134,7 @@ LINK = np.dtype(
 )
 #: No frames.
 _NONE = -1
-#: By CAN id: its link (-1: none), its set (of an authentication frame -1) and its place in the set.
+#: Place of a CAN id: its link (-1: none), its set (of an authentication frame -1) and its place in the set.
 _PLACE = np.dtype(fields("i8", "link which position"), align=True)
 
 

@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -80,17 +81,20 @@ def data_of(
         current = store.current if store else None
         return json.dumps({"date": current.date, "values": current.values} if current else {}).encode()
 
+    def present(row: int) -> bytes:
+        return frame_of(corners[row], shared.of(row), round(time.time())).encode()
+
     def facts(row: int) -> bytes:
         estimate = shared.of(row)
         return b"not known" if estimate is None else sentences(int(estimate["facts"])).encode()
 
-    found: dict[int, Callable[[], bytes]] = {SOFTWARE: lambda: __version__.encode()}
+    found: dict[int, Callable[[], bytes]] = {SOFTWARE: __version__.encode}
     for name in corners_of:
         row = CORNERS.index(name)
-        found[CALIBRATION + row] = lambda name=name: calibration(name)
-        found[LEARNED + row] = lambda name=name: learned(name)
-        found[ESTIMATE + row] = lambda row=row: frame_of(corners[row], shared.of(row), round(time.time())).encode()
-        found[FACTS + row] = lambda row=row: facts(row)
+        found[CALIBRATION + row] = partial(calibration, name)
+        found[LEARNED + row] = partial(learned, name)
+        found[ESTIMATE + row] = partial(present, row)
+        found[FACTS + row] = partial(facts, row)
     return found
 
 

@@ -152,9 +152,6 @@ class Slave:
         resource = _ACQUISITION | _CALIBRATION * (self._segment is not None)
         return struct.pack("<BBBHBB", resource, _MODE, self._transport.max_cto, self._transport.max_dto, _VERSION, _VERSION)
 
-    def _disconnect(self) -> None:
-        self.end()
-
     def _status(self) -> bytes:
         return struct.pack("<BBxH", _DAQ_RUNNING * self.acquiring, 0, 0)
 
@@ -431,7 +428,7 @@ def _table(rows: Iterable[tuple[str, int, str, Callable[..., bytes | None]]]) ->
 #: Commands that the slave answers, by the standard's names: always, and only if numbers may be written.
 READING = _table([
     ("CONNECT", CONNECT, "B", Slave._connect),
-    ("DISCONNECT", 0xFE, "", Slave._disconnect),
+    ("DISCONNECT", 0xFE, "", Slave.end),
     ("GET_STATUS", 0xFD, "", Slave._status),
     ("SYNCH", 0xFC, "", Slave._synch),
     ("GET_COMM_MODE_INFO", 0xFB, "", Slave._communication_mode),

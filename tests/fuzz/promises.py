@@ -14,9 +14,10 @@ import sys
 from functools import cache
 
 import numpy as np
+import wirekit
 
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.calibration.files import load_calibration
+from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.jit import njit
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
@@ -40,7 +41,7 @@ _KEPT = ("time_ns", "cycle", "counter", "source", "force", "sigma", "stiffness_f
 @cache
 def _drive(seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Frames, and the true force of each cycle, N."""
-    plant = np.array([plant_from_calibration(load_calibration(resource("config/calibration.yaml")), 0)])
+    plant = np.array([plant_from_calibration(shipped_calibration(), 0)])
     schedule = city_drive().first(seconds)
     frames, truth = Car(plant, ("FL",), start_ns=_START_NS).run(commands_of(schedule, ("FL",)), schedule.drives)
     return frames, truth["force"][:, 0]
@@ -91,11 +92,6 @@ def _foreign(rng: np.random.Generator, count: int, begin_ns: int, end_ns: int) -
     return frames
 
 
-def _merged(*parts: np.ndarray) -> np.ndarray:
-    frames = np.concatenate(parts)
-    return frames[np.argsort(frames["time_ns"], kind="stable")]
-
-
 def _off(estimates: np.ndarray, force_N: np.ndarray) -> np.ndarray:
     """By how much each estimate is off, N, from the nearest true force of the cycles about it."""
     about = np.lib.stride_tricks.sliding_window_view(np.pad(force_N, _LATE_CYCLES, mode="edge"), 2 * _LATE_CYCLES + 1)
@@ -111,7 +107,7 @@ def noise(rng: np.random.Generator, seconds: float, rate: int) -> int:
     foreign["flags"] = np.where(rng.random(len(foreign)) < 0.8, 0, rng.integers(0, 16, len(foreign)))
     _damage_all(foreign)
     quiet, expected, _ = _run(genuine)
-    disturbed, estimates, _ = _run(_merged(genuine, foreign))
+    disturbed, estimates, _ = _run(wirekit.merged(genuine, foreign))
     assert len(estimates) == len(expected), "an estimate was lost or came besides"
     for name in _KEPT:
         assert estimates[name].tobytes() == expected[name].tobytes(), name
@@ -132,7 +128,7 @@ def hostile(rng: np.random.Generator, seconds: float, rate: int) -> int:
     foreign = _foreign(rng, round(0.2 * rate * seconds * rng.choice([0.01, 0.1, 1.0])), begin_ns, end_ns)
     statuses = rng.choice([0, 0, 0, 1, 2, 15], len(foreign))
     _protect_all(foreign, rng.integers(0, COUNTER_MODULO + 1, len(foreign)), statuses)
-    frames = _merged(kept, doubled, foreign)
+    frames = wirekit.merged(kept, doubled, foreign)
     pipeline, estimates, sent = _run(frames)
     layout = default_layout()[0]
     for slot in range(SLOTS):
