@@ -54,7 +54,7 @@ def drive(seconds=12.0, wheel_speed=20.0):
     count = round(seconds / DT)
     samples = np.zeros(count, SAMPLE)
     time = DT * np.arange(count)
-    angle = 20.0 * np.clip(time / 2.0, 0.0, 1.0) + 1.5 * np.sin(2.0 * time) * (time > 2.0)
+    angle = 20.0 * np.clip(time / 2.0, 0.0, 1.0) + 1.5 * np.sin(2.0 * (time - 2.0)) * (time > 2.0)
     samples["dt"] = np.where(np.arange(count) == 0, 0.0, DT)
     samples["angle"], samples["speed"] = angle, np.gradient(angle, DT)
     samples["wheel_speed"] = wheel_speed

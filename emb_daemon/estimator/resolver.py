@@ -15,8 +15,10 @@ from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 #: what a contact angle jumps by at once), is no motion.
 SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
-#: Share of the largest speed that a motor gains within a cycle only if its angle says so: it would be there within 16 ms.
-_GAINED = 0.25
+#: Share of the largest speed that no motor gains within a cycle, nor a log that is interpolated from 100 Hz, and that by which
+#: its angle may differ from the last speed and still go on as before: one that did gain so much has gone on by half of it.
+#: Speed over the largest that no other voltage or field makes.
+_GAINED, _AS_BEFORE, _NO_SPEED = 0.5, 0.2, 2.0
 #: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
 #: this many seconds between both: 12 turns a second without speed. Standard deviation of such a jump, rad.
 SLIP_RAD, _SLIP_DELAY_S, _ZERO_RAD = 0.3, 0.01, 0.1
@@ -43,17 +45,19 @@ _REPEATED = 3
 
 @njit
 def believe_speed(s: Record, p: Record, m: Record) -> None:
-    """Replace a speed that hardly a motor gains or loses within a cycle. The last speed goes on, unless the angle says the
-    same as this one; if the last one was wrong, too, the angle tells the speed."""
-    possible = _GAINED * p.maximum_speed
+    """Replace a speed that is neither the last one nor what the angle has gone, if these agree or if one of them is far beyond
+    the motor's largest. The last speed goes on; if that was wrong, too, the angle tells the speed."""
     was_wrong, s.speed_wrong = s.speed_wrong, False
     stuck = s.plausibility.still > 1
-    if stuck or not 0.0 < m.dt <= ONE_CYCLE_S or abs(m.speed - s.speed) <= possible:
+    if stuck or not 0.0 < m.dt <= ONE_CYCLE_S:
         return
     by_angle = (m.angle - s.angle) / m.dt
-    if abs(m.speed - by_angle) > possible:
+    gained, apart = abs(m.speed - s.speed), abs(by_angle - s.speed)
+    if min(gained, abs(m.speed - by_angle)) <= _GAINED * p.maximum_speed:
+        return
+    if apart <= _AS_BEFORE * p.maximum_speed or max(abs(m.speed), abs(by_angle)) > _NO_SPEED * p.maximum_speed:
         s.speed_wrong = True
-        m.speed = by_angle if was_wrong and abs(by_angle - s.speed) <= possible else s.speed
+        m.speed = by_angle if was_wrong and apart <= _GAINED * p.maximum_speed else s.speed
 
 
 @njit
