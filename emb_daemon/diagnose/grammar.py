@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
-from emb_daemon.diagnose.model import LASTING, LITTLE, TOLERANCE, Model
+from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
@@ -55,8 +55,6 @@ _NOT_SHORTER = "these logs are described more shortly without it"
 _OF_HEAT = 2
 #: Ports and signals that are fitted where a small step does not tell.
 _FITTED = 4
-#: Fits after another that such a term is given.
-_FITS = 8
 #: Further shapes of one place that are fitted beside the first.
 _SHAPES = 3
 #: Share of what a term does (RMS) that one of another place must gain beside it: a power, or a memory, that is nearly right is
@@ -218,7 +216,7 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
         for known in sorted(find_known(bare, channel), key=lambda c: (c.effect.hook, c.effect.signal) != _place(proven)):
             known = replace(known, names=term, p_value=proven.p_value, q_value=proven.q_value)
             named = bare.entered([known])
-            named = replace(named, model=_arrived(named.model, channel))
+            named = replace(named, model=named.model.arrived(channel))
             if known.effect.name in named.accepted and _description(named, channel) <= _description(selection, channel):
                 selection = named
                 break
@@ -251,8 +249,11 @@ def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:
 
 def _wanted(selection: Selection, channel: str) -> bool:
     """Whether enough is left, of what lasts longer than noise, for a term to be made up."""
-    screen = Screen(selection.model, channel, 1 if channel == CHANNEL_OF_HEAT else COARSE)
-    floor = selection.screening.floor(selection.model, channel, made=True)
+    model, floor = selection.model, selection.screening.floor(selection.model, channel, made=True)
+    if channel == CHANNEL_OF_HEAT:
+        left = float(np.square(Screen(model, channel, 1).residual).sum()) - noise_left(model, channel, 1)
+        return left >= model.counted(channel) * floor**2
+    screen = Screen(model, channel, COARSE)
     return rmse(screen.residual[:, 0] * screen.means.per_mean) >= floor
 
 
@@ -434,15 +435,6 @@ def _signals(model: Model) -> list[np.ndarray]:
     return result
 
 
-def _arrived(model: Model, channel: str) -> Model:
-    """Fitted until nothing is gained: from far away one fit does not arrive."""
-    for _ in range(_FITS):
-        before, model = model.noise(channel), model.refined({channel})
-        if model.noise(channel) > LITTLE * before:
-            break
-    return model
-
-
 def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
     """The best forms of other ports and signals that gain nearly as much, or that resampled episodes choose often enough.
 
@@ -539,7 +531,7 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     model = replace(before, bench=bench).entered(values, centre=sizes).refined({channel})
     evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0), LASTING[channel])
     gain = model.rms(evidence.gain, channel)
-    model = _arrived(model, channel)
+    model = model.arrived(channel)
     if not bench.straight:
         gain = float(np.sqrt(max(before.noise(channel) - model.noise(channel), 0.0)))
     worse = model.noise(channel) >= before.noise(channel)
