@@ -252,7 +252,7 @@ def _wanted(selection: Selection, channel: str) -> bool:
     model, floor = selection.model, selection.screening.floor(selection.model, channel, made=True)
     if channel == CHANNEL_OF_HEAT:
         left = float(np.square(Screen(model, channel, 1).residual).sum()) - noise_left(model, channel, 1)
-        return left >= model.counted(channel) * floor**2
+        return bool(left >= model.counted(channel) * floor**2)
     screen = Screen(model, channel, COARSE)
     return rmse(screen.residual[:, 0] * screen.means.per_mean) >= floor
 
