@@ -33,7 +33,7 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, SHADOW, Candidate
-from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, settle_heat
+from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, recalibrate_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import HOOKS
@@ -137,8 +137,8 @@ def search_heat(bench: warmth.HeatBench) -> Selection:
 
 
 def _with_heat_terms(selection: Selection) -> Selection:
-    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them by what
-    matters than for conductances and capacities that are refitted alone.
+    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them than for
+    conductances and capacities that are refitted alone.
 
     They stand as fitted with conductances and capacities to a measured brake torque: in the whole estimator friction and force
     would have a say in them."""
@@ -155,9 +155,10 @@ def _with_heat_terms(selection: Selection) -> Selection:
     there = replace(bare, bench=model.bench.under(terms)).entered(found.model.values, chosen=found.model.values)
     there = replace(there, fits=there.fits | {CHANNEL_OF_HEAT: found.model.fits[CHANNEL_OF_HEAT]})
     with_terms = replace(selection, model=there).noted(found.candidates.values())
-    # As they would be applied: a friction of the pads that is not applied helps neither.
-    alone, beside = (settle_heat(s).model.noise(CHANNEL_OF_HEAT) for s in (selection, with_terms))
-    if alone - beside < selection.screening.floor(model, CHANNEL_OF_HEAT, made=True) ** 2:
+    # As they would be applied, each with the pads' friction that then makes the heat; without it terms would be held against
+    # conductances that make up for a friction which is a little off.
+    alone, beside = (recalibrate_heat(s).model.noise(CHANNEL_OF_HEAT) for s in (selection, with_terms))
+    if beside >= alone:
         worse = "with a brake torque that is not measured, what is recalibrated without it explains the temperatures as well"
         return selection.noted(replace(c, accepted=False, reason=worse) for c in found.candidates.values() if c.accepted)
     return with_terms
