@@ -19,7 +19,7 @@ from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
 from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, validation_gains
 from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
-from emb_daemon.diagnose.late_reference import reference_late_s
+from emb_daemon.diagnose.late_reference import may_be_late, reference_late_s
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
@@ -182,21 +182,28 @@ def diagnose(
         result = diagnose_bench(bench, judges, progress)
         # What is found no longer hides it.
         later_s = _later_s(result) if again else 0.0
-        if later_s < _LATER_S:
+        if not later_s:
             break
         late_s += later_s
     return replace(result, seconds=time.monotonic() - begin, reference_late_s=late_s)
 
 
 def _later_s(result: Diagnosis) -> float:
-    """Time (s) by which the reference force is later still, by what was found; asked where something is left, or an angle was
-    found to be of a time that is still to come."""
+    """Time (s) by which the reference force is later still, by what was found, if that is worth a second search; asked where
+    something is left, or an angle was found to be of a time that is still to come: that is the reference's, however short the
+    time is, unless the current says otherwise."""
     found = result.calibration
-    early = known_delay(to_parameters(found)["effects"]) < 0.0
-    if result.unexplained is None and not early:
+    before_s, after_s = (known_delay(to_parameters(c)["effects"]) for c in (result.bench.calibration, found))
+    known_s = min(before_s, 0.0)
+    early_s = max(known_s - after_s, 0.0)
+    if result.unexplained is None and not early_s:
         return 0.0
-    delays = {f"effects.{name}.{_DELAY}": 0.0 for name, values in found.effects.items() if _DELAY in values}
-    return reference_late_s(result.bench.under(moved(found, delays) if early else found))
+    delays = {f"effects.{name}.{_DELAY}": known_s for name, values in found.effects.items() if _DELAY in values}
+    bench = result.bench.under(moved(found, delays) if early_s else found)
+    later_s = reference_late_s(bench)
+    if later_s >= _LATER_S:
+        return later_s
+    return early_s if early_s and may_be_late(bench) else 0.0
 
 
 def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Diagnosis:

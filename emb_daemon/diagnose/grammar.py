@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
-from emb_daemon.diagnose.model import LASTING, LITTLE, TOLERANCE, Model
+from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
@@ -33,7 +33,7 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, SHADOW, Candidate
-from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, settle_heat
+from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, recalibrate_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import HOOKS
@@ -55,8 +55,6 @@ _NOT_SHORTER = "these logs are described more shortly without it"
 _OF_HEAT = 2
 #: Ports and signals that are fitted where a small step does not tell.
 _FITTED = 4
-#: Fits after another that such a term is given.
-_FITS = 8
 #: Further shapes of one place that are fitted beside the first.
 _SHAPES = 3
 #: Share of what a term does (RMS) that one of another place must gain beside it: a power, or a memory, that is nearly right is
@@ -139,8 +137,8 @@ def search_heat(bench: warmth.HeatBench) -> Selection:
 
 
 def _with_heat_terms(selection: Selection) -> Selection:
-    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them by what
-    matters than for conductances and capacities that are refitted alone.
+    """The same with terms of the heat balance that recordings prove, where the whole estimator is better for them than for
+    conductances and capacities that are refitted alone.
 
     They stand as fitted with conductances and capacities to a measured brake torque: in the whole estimator friction and force
     would have a say in them."""
@@ -157,9 +155,10 @@ def _with_heat_terms(selection: Selection) -> Selection:
     there = replace(bare, bench=model.bench.under(terms)).entered(found.model.values, chosen=found.model.values)
     there = replace(there, fits=there.fits | {CHANNEL_OF_HEAT: found.model.fits[CHANNEL_OF_HEAT]})
     with_terms = replace(selection, model=there).noted(found.candidates.values())
-    # As they would be applied: a friction of the pads that is not applied helps neither.
-    alone, beside = (settle_heat(s).model.noise(CHANNEL_OF_HEAT) for s in (selection, with_terms))
-    if alone - beside < selection.screening.floor(model, CHANNEL_OF_HEAT, made=True) ** 2:
+    # As they would be applied, each with the pads' friction that then makes the heat; without it terms would be held against
+    # conductances that make up for a friction which is a little off.
+    alone, beside = (recalibrate_heat(s).model.noise(CHANNEL_OF_HEAT) for s in (selection, with_terms))
+    if beside >= alone:
         worse = "with a brake torque that is not measured, what is recalibrated without it explains the temperatures as well"
         return selection.noted(replace(c, accepted=False, reason=worse) for c in found.candidates.values() if c.accepted)
     return with_terms
@@ -218,7 +217,7 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
         for known in sorted(find_known(bare, channel), key=lambda c: (c.effect.hook, c.effect.signal) != _place(proven)):
             known = replace(known, names=term, p_value=proven.p_value, q_value=proven.q_value)
             named = bare.entered([known])
-            named = replace(named, model=_arrived(named.model, channel))
+            named = replace(named, model=named.model.arrived(channel))
             if known.effect.name in named.accepted and _description(named, channel) <= _description(selection, channel):
                 selection = named
                 break
@@ -251,8 +250,11 @@ def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:
 
 def _wanted(selection: Selection, channel: str) -> bool:
     """Whether enough is left, of what lasts longer than noise, for a term to be made up."""
-    screen = Screen(selection.model, channel, 1 if channel == CHANNEL_OF_HEAT else COARSE)
-    floor = selection.screening.floor(selection.model, channel, made=True)
+    model, floor = selection.model, selection.screening.floor(selection.model, channel, made=True)
+    if channel == CHANNEL_OF_HEAT:
+        left = float(np.square(Screen(model, channel, 1).residual).sum()) - noise_left(model, channel, 1)
+        return bool(left >= model.counted(channel) * floor**2)
+    screen = Screen(model, channel, COARSE)
     return rmse(screen.residual[:, 0] * screen.means.per_mean) >= floor
 
 
@@ -434,15 +436,6 @@ def _signals(model: Model) -> list[np.ndarray]:
     return result
 
 
-def _arrived(model: Model, channel: str) -> Model:
-    """Fitted until nothing is gained: from far away one fit does not arrive."""
-    for _ in range(_FITS):
-        before, model = model.noise(channel), model.refined({channel})
-        if model.noise(channel) > LITTLE * before:
-            break
-    return model
-
-
 def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
     """The best forms of other ports and signals that gain nearly as much, or that resampled episodes choose often enough.
 
@@ -539,7 +532,7 @@ def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     model = replace(before, bench=bench).entered(values, centre=sizes).refined({channel})
     evidence = model.evidence_against(dict.fromkeys(amplitudes, 0.0), LASTING[channel])
     gain = model.rms(evidence.gain, channel)
-    model = _arrived(model, channel)
+    model = model.arrived(channel)
     if not bench.straight:
         gain = float(np.sqrt(max(before.noise(channel) - model.noise(channel), 0.0)))
     worse = model.noise(channel) >= before.noise(channel)

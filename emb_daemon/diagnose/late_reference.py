@@ -26,10 +26,12 @@ _TURNS, _LITTLE = 5, 0.1
 def reference_late_s(bench: Bench) -> float:
     """Time (s) by which the reference force of a bench's logs comes after angle and current; 0 unless both say so."""
     logs, late_s = [trial.log for trial in bench.trials], 0.0
-    if not all(map(bench.channel_of, ("stiffness", "torque"))) or not bench.has_reference:
+    if not _is_told(bench):
         return late_s
     for _ in range(_TURNS):
-        later_s = _later_s(bench)
+        later_s, sigma_s, alike = _compare(bench)
+        if not alike or later_s <= _SURELY * sigma_s:
+            break
         late_s += later_s
         if later_s < _LITTLE * CYCLE_S:
             break
@@ -37,8 +39,18 @@ def reference_late_s(bench: Bench) -> float:
     return late_s
 
 
-def _later_s(bench: Bench) -> float:
-    """The same by the line drawn where the force is."""
+def may_be_late(bench: Bench) -> bool:
+    """Whether the current says nothing else of the reference force's time than the angle does."""
+    return _is_told(bench) and _compare(bench)[2]
+
+
+def _is_told(bench: Bench) -> bool:
+    return all(map(bench.channel_of, ("stiffness", "torque"))) and bench.has_reference
+
+
+def _compare(bench: Bench) -> tuple[float, float, bool]:
+    """Time (s) by which the force is late beside the angle, by the line drawn where the force is, its standard deviation, and
+    whether the current says the same."""
     model = Model.of(bench).refined({"stiffness", "torque"})
     rate = np.concatenate([np.gradient(np.nan_to_num(trial.force_N), trial.log.time_s) for trial in bench.trials])
     speed = np.concatenate([trial.log.samples["speed"] for trial in bench.trials])
@@ -50,7 +62,7 @@ def _later_s(bench: Bench) -> float:
     # Where a motor clamps the force's rate follows its speed, and so does a viscous friction that nobody has calibrated.
     by_angle, by_current = told("stiffness", -rate), told("torque", rate, [speed])
     if not len(by_angle.values) or not len(by_current.values):
-        return 0.0
+        return 0.0, np.inf, False
     [late_s], [sigma_s], [other_s], [its_sigma_s] = by_angle.values, by_angle.sigmas, by_current.values, by_current.sigmas
     alike = abs(late_s - other_s) < min(_SURELY * np.hypot(sigma_s, its_sigma_s), _WITHIN * CYCLE_S)
-    return float(late_s) if alike and late_s > _SURELY * sigma_s else 0.0
+    return float(late_s), float(sigma_s), bool(alike)

@@ -17,6 +17,8 @@ from emb_daemon.offline.fit import Block, Fit, Free, fit
 _INFLATION = 5.0
 #: A fit ends when the cost falls by less than this share, or after so many evaluations: screening and the next round follow.
 TOLERANCE, _EVALUATIONS = 2e-3, 8
+#: Fits one after the other until one gains next to nothing.
+_FITS = 8
 #: Heat and force that rest on each other are fitted in turn so often at most, until a turn leaves this share of the force's
 #: mean square, and of the temperatures' or these are right within the standard deviation of a thermocouple (IEC 60584, class
 #: 1), K.
@@ -137,6 +139,15 @@ class Model:
         for channel in (*HEAT_CHANNELS, *FORCE_CHANNELS):
             if channel in channels and model.own(channel):
                 model = model._fitted(channel)
+        return model
+
+    def arrived(self, channel: str) -> "Model":
+        """A channel fitted until nothing is gained: from far away one fit does not arrive."""
+        model = self
+        for _ in range(_FITS):
+            before, model = model.noise(channel), model.refined({channel})
+            if model.noise(channel) > LITTLE * before:
+                break
         return model
 
     def settled(self, channels: Iterable[str]) -> "Model":

@@ -11,7 +11,7 @@ A candidate is refused unless it passes all of
 5. placebos: with what it rests on disturbed it must do much worse.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TypeAlias
@@ -34,18 +34,18 @@ SHADOW = "a shadow of something else"
 #: False discovery rate over the catalogue.
 Q_VALUE = 0.01
 #: A gain matters from this share of the channel's residual, or of what lasts of it where that is less, and from this share of
-#: the RMS of the reference: two parts in a thousand of the force is what force sensors of test rigs are good for. On simulated
-#: brakes with nothing hidden the best of all forms gains 0.07 to 0.12 of what lasts (four drives), and the best effect of the
-#: catalogue that chance does not explain 0.11 (twelve).
+#: the RMS of what is measured: force sensors of test rigs are good for two parts in a thousand, and thermocouples of what they
+#: have risen by (IEC 60584, class 1: 0.4 % are two standard deviations). On simulated brakes with nothing hidden the best of
+#: all forms gains 0.07 to 0.12 of what lasts (four drives), and the best effect of the catalogue that chance does not explain
+#: 0.11 (twelve); of 30 heat balances none gains more than 0.0014 of the rise.
 _RESIDUAL_SHARE, _LASTING_SHARE, _SIGNAL_SHARE = 0.06, 0.2, 0.002
 #: Samples in the shortest means, which leave out where friction turns over. How it does is a guess of every model: where it
 #: turns over late it looks like a friction that rises with speed.
 _SLIDING = 2
 #: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
 _FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
-#: The same of a term (K), held against all that heat capacities and conductances can do in these logs, which may take four
-#: fifths of it and will not in the next: the standard deviation of a thermocouple (IEC 60584, class 1: 1.5 K are two).
-_MADE_K = 0.75
+#: Standard deviation of a thermocouple (IEC 60584, class 1: 1.5 K are two): what a heat balance need not do better.
+_THERMOCOUPLE_K = 0.75
 #: Share of the best model-free explanation that a candidate must reach, and of its own gain that placebos must not.
 OF_MODEL_FREE, OF_PLACEBO = 0.6, 0.5
 #: Draws of a placebo that runs through the estimator, and of one that does not.
@@ -128,11 +128,15 @@ class Screening:
         self.force_N: float = rmse(self.signals["clamp_force"]) if bench.clamps else rmse(bench.load_N)
         self._size = dict.fromkeys(bench.channels, self.force_N)
         self._size["brake_torque"] = rmse(braking) if len(braking) else 0.0
+        self._size["temperature"] = risen_K([trial.temperature_C for trial in bench.trials])
 
     def floor(self, model: Model, channel: str, made: bool = False) -> float:
-        """Least RMS of an effect that matters, or of the heat balance of a term that is ``made``, in the channel's unit."""
-        if channel == "temperature":
-            return _MADE_K if made else _FLOOR_K
+        """Least RMS of an effect that matters, or of the heat balance of a term that is ``made``, in the channel's unit.
+
+        A term is held against all that heat capacities and conductances can do in these logs, which may take four fifths of it
+        and will not in the next."""
+        if channel == "temperature" and not made:
+            return _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
         lasting = _LASTING_SHARE * np.sqrt(model.lasting(channel, LASTING[channel]))
         left = min(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), lasting)
@@ -143,7 +147,7 @@ class Screening:
         (`unexplained.achieved`), or where these are its own data by what of the residual is noise or does not matter."""
         if self.bench.own_data:
             noise = sample_noise(model.residual[channel], SIDE_BY_SIDE.get(channel, 1))
-            return max(noise, self.floor(model, channel, made=True))
+            return max(noise, _THERMOCOUPLE_K if channel == "temperature" else self.floor(model, channel))
         return achieved(self.bench.calibration, channel, force_N, rise_K, samples)
 
     # -- tests --------------------------------------------------------------------------------------------------------
@@ -330,6 +334,12 @@ class Screening:
     def _columns(self, model: Model, bench: Bench, candidate: Candidate, shape: tuple) -> list[np.ndarray]:
         at, heat = (model.residual, model.heat) if bench is model.bench else bench.run(model.values)
         return bench.regressors(model.values, [Probe(c, shape) for c in candidate.amplitudes], at, heat)
+
+
+def risen_K(temperatures: Iterable[np.ndarray]) -> float:
+    """RMS by which measured temperatures, of each log (N, places), differ from those it begins with; 0 if there are none."""
+    rises = np.concatenate([(own - own[:1]).ravel() for own in temperatures])
+    return rmse(rises[np.isfinite(rises)]) if np.isfinite(rises).any() else 0.0
 
 
 def _together(model: Model, candidate: Candidate, signal: str, tested: Sequence[Candidate]) -> float:

@@ -19,7 +19,7 @@ from emb_daemon.diagnose.forms import FORMED, Form
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.prospects import CHANCES, SHIFTS, Scores, Screen, Search, covered_by, record_of
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench, count_over
-from emb_daemon.diagnose.screening import Rivals, Screening
+from emb_daemon.diagnose.screening import Rivals, Screening, risen_K
 from emb_daemon.effects.base import HOOKS
 from emb_daemon.effects.terms import PORTS, SIGNALS
 from emb_daemon.errors import InputError
@@ -58,7 +58,7 @@ class HeatBench(Bench):
         inside = np.append(np.tile(np.array(DEPTHS_M) <= 1e-3 * calibration.pad_thickness_mm, 2), True)
         self._every = [max(round(_EVERY_S / r.step_s), 1) for r in recordings]
         pairs = list(zip(recordings, self._every, strict=True))
-        self._measured = [np.where(inside, r.measured[:, ::every].T, np.nan) for r, every in pairs]
+        self.measured: list[np.ndarray] = [np.where(inside, r.measured[:, ::every].T, np.nan) for r, every in pairs]
         cut = [(r.time_s[::every] // _EPISODE_S).astype(int) for r, every in pairs]
         self.sample_episode: np.ndarray = np.repeat(count_over(cut), _PLACES)
         self.episode: dict[str, np.ndarray] = {CHANNEL_OF_HEAT: self.sample_episode}
@@ -71,7 +71,7 @@ class HeatBench(Bench):
         """Measured minus modelled temperatures (K) under PARAMETERS, zero where there are none."""
         parts = [
             measured - simulate(parameters, r, every=every)[:, :_PLACES]
-            for r, every, measured in zip(self.recordings, self._every, self._measured, strict=True)
+            for r, every, measured in zip(self.recordings, self._every, self.measured, strict=True)
         ]
         return np.nan_to_num(np.concatenate(parts)).ravel()
 
@@ -91,11 +91,11 @@ class HeatBench(Bench):
         return result
 
     def model(self) -> Model:
-        """The calibration's heat balance, fitted to the recordings."""
+        """The calibration's heat balance, fitted until nothing is gained: what a fit leaves on its way is no term's."""
         base = [c for c in base_coordinates(self.calibration, []) if c.channel == CHANNEL_OF_HEAT]
         further = [scaled_coordinate(self.calibration, [key], CHANNEL_OF_HEAT, prior) for key, prior in _FURTHER]
         start: dict[Coordinate, float] = {c: c.start for c in (*base, *further)}
-        return Model(self, start, *self.run(start), centre=start).refined([CHANNEL_OF_HEAT])
+        return Model(self, start, *self.run(start), centre=start).arrived(CHANNEL_OF_HEAT)
 
 
 class HeatScreening(Screening):
@@ -106,6 +106,7 @@ class HeatScreening(Screening):
         self.initial: dict[str, np.ndarray] = model.residual
         self.coordinates: dict[str, dict[str, Coordinate]] = {}
         self.signals: dict[str, np.ndarray] = {"clamp_force": np.zeros(0)}
+        self._size = {CHANNEL_OF_HEAT: risen_K(bench.measured)}
 
     def rival(self, model: Model, channel: str, rivals: Rivals, samples: int = 1) -> tuple[float, str]:
         return 0.0, ""

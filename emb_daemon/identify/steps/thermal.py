@@ -162,7 +162,7 @@ def find_terms(recordings: list[Recording], heated: Calibration) -> tuple[tuple[
     model, floor = found.model, found.screening.floor(found.model, CHANNEL_OF_HEAT, made=True)
     terms = with_terms(model.bench.calibrated(model.values), found).terms if found.accepted else ()
     left_K = float(np.sqrt(model.noise(CHANNEL_OF_HEAT)))
-    if not is_beyond(left_K, floor):
+    if not is_beyond(left_K, found.screening.achieved(model, CHANNEL_OF_HEAT, np.zeros(0), np.zeros(0))):
         return terms, 0.0, ""
     gains = HeatSearch(model).dependence()
     return terms, left_K, dependences(CHANNEL_OF_HEAT, gains, model.counted(CHANNEL_OF_HEAT), floor)[0].signal
