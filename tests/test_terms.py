@@ -46,7 +46,7 @@ def drive(seconds=8.0):
     time = DT * np.arange(round(seconds / DT))
     samples = np.zeros(len(time), SAMPLE)
     samples["dt"] = np.where(time == 0.0, 0.0, DT)
-    samples["angle"] = 20.0 * np.clip(time / 2.0, 0.0, 1.0) + 1.5 * np.sin(2.0 * time) * (time > 2.0)
+    samples["angle"] = 20.0 * np.clip(time / 2.0, 0.0, 1.0) + 1.5 * np.sin(2.0 * (time - 2.0)) * (time > 2.0)
     samples["speed"] = np.gradient(samples["angle"], DT)
     samples["current_q"], samples["has_current"] = 10.0, True
     samples["brake_torque"] = np.nan

@@ -37,7 +37,7 @@ Q_VALUE = 0.01
 #: the RMS of what is measured: force sensors of test rigs are good for two parts in a thousand, and thermocouples of what they
 #: have risen by (IEC 60584, class 1: 0.4 % are two standard deviations). On simulated brakes with nothing hidden the best of
 #: all forms gains 0.07 to 0.12 of what lasts (four drives), and the best effect of the catalogue that chance does not explain
-#: 0.11 (twelve); of 30 heat balances none gains more than 0.0014 of the rise.
+#: 0.11 (twelve).
 _RESIDUAL_SHARE, _LASTING_SHARE, _SIGNAL_SHARE = 0.06, 0.2, 0.002
 #: Samples in the shortest means, which leave out where friction turns over. How it does is a guess of every model: where it
 #: turns over late it looks like a friction that rises with speed.
