@@ -7,7 +7,7 @@ import numpy as np
 
 from emb_daemon.estimator.hypotheses import open_again
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, shift_zero
-from emb_daemon.jit import Record, hypot, njit
+from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.fusion import CONTACT, STATES
 from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 
@@ -15,9 +15,9 @@ from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 #: what a contact angle jumps by at once), is no motion.
 SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
-#: Share of the largest speed that no motor gains within a cycle, nor a log that is interpolated from 100 Hz, and that by which
-#: its angle may differ from the last speed and still go on as before: one that did gain so much has gone on by half of it.
-#: Speed over the largest that no other voltage or field makes.
+#: Shares of the largest speed. No motor gains the first within a cycle, nor does a log that is interpolated from 100 Hz. An
+#: angle goes on as before within the second of the last speed: one that had gained so much would have by half of it. Nothing
+#: turns at the third, whatever voltage and field.
 _GAINED, _AS_BEFORE, _NO_SPEED = 0.5, 0.2, 2.0
 #: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
 #: this many seconds between both: 12 turns a second without speed. Standard deviation of such a jump, rad.
@@ -166,14 +166,13 @@ def _drift(s, m, slip, turned):
 def _move_zero(s, p, moved, sigma):
     """Refer all stored angles to a zero that has moved by ``moved`` rad, known with standard deviation ``sigma`` rad."""
     s.drifted = s.stood_s = 0.0
-    sigma *= s.gear_slope
     before = s.covariance[CONTACT, CONTACT]
     if s.away_s > _AWAY_S:
         s.away = s.away_variance = s.away_s = 0.0
         s.known_before = before
     went = s.away
     s.away += moved
-    s.away_variance += sigma * sigma
+    s.away_variance += sq(sigma)
     if abs(s.away) < _SURELY * sqrt(s.away_variance) < abs(went):
         # Messages were wrong: zero and contact angle are where they were, and known as well.
         shift_zero(s, -went)
@@ -184,7 +183,7 @@ def _move_zero(s, p, moved, sigma):
             s.covariance[i, CONTACT] *= known
         return
     shift_zero(s, moved)
-    s.covariance[CONTACT, CONTACT] += sigma * sigma
+    s.covariance[CONTACT, CONTACT] += sq(s.gear_slope * sigma)
     open_again(s, p)
     s.contact.confirmed = False
 
