@@ -31,7 +31,7 @@ _FREE_OF = re.compile(r"(?i)(no|not|kein|ohne) (error|fault|fail|fehler)")
 
 def decoded(
     mapping: "Mapping", path: Path, recorded: Recorded, wanted: Iterable[tuple[str | None, str]]
-) -> dict[tuple, tuple]:
+) -> dict[tuple[str | None, str], tuple[np.ndarray, np.ndarray]]:
     """Times and values of the rig's signals by bus and name, without those in frames that are too short."""
     found = {}
     by_message: dict[tuple[str | None, str], list[str]] = {}

@@ -7,6 +7,7 @@ import itertools
 import re
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 from emb_daemon.errors import InputError, tell
 from emb_daemon.wire.units import known_as
@@ -55,8 +56,8 @@ def some_of(wanted: str, names: list[str]) -> str:
     return ", ".join(names if len(names) <= LISTED else [*get_close_matches(wanted, names, LISTED, 0.0), "…"]) or "none"
 
 
-def read_text(path: Path, content: bytes, names: list[str]):
-    """A table as text, as measurement tools write it: text before the header and units after it are skipped, rows with another
+def read_text(path: Path, content: bytes, names: list[str]) -> Any:
+    """A table (pyarrow) from text, as measurement tools write it: text before the header and units after it are skipped, rows with another
     number of cells (a truncated last one) left out, with a note on stderr."""
     import pyarrow.csv
 
