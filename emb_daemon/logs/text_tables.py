@@ -57,8 +57,8 @@ def some_of(wanted: str, names: list[str]) -> str:
 
 
 def read_text(path: Path, content: bytes, names: list[str]) -> Any:
-    """A table (pyarrow) from text, as measurement tools write it: text before the header and units after it are skipped, rows with another
-    number of cells (a truncated last one) left out, with a note on stderr."""
+    """A table (pyarrow) from text, as measurement tools write it: text before the header and units after it are skipped, rows
+    with another number of cells (a truncated last one) left out, with a note on stderr."""
     import pyarrow.csv
 
     content = _as_utf8(content, names)
