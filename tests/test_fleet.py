@@ -225,6 +225,11 @@ def test_workers_may_die(tmp_path, monkeypatch, lives):
     assert told == [(number, 8) for number in range(1, 9)]
 
 
+def test_many_more_items_than_are_submitted_ahead_are_all_done_in_their_order(scheduler):
+    with cluster(scheduler) as client:
+        assert run(client, abs, range(-50, 0)) == list(range(50, 0, -1))
+
+
 @pytest.mark.trial
 def test_a_worker_has_no_reader_of_files_that_another_process_reads():
     with cluster(workers=1) as client:

@@ -7,6 +7,7 @@ import time
 from types import SimpleNamespace
 
 import can
+import cantools
 import numpy as np
 import pytest
 import wirekit
@@ -15,9 +16,10 @@ from rich.console import Console
 from emb_daemon.cli.main import main
 from emb_daemon.demo import view
 from emb_daemon.demo.recorder import Recorder
-from emb_daemon.monitor.listener import HISTORY_S, SECOND_NS, Listener
+from emb_daemon.monitor.listener import HISTORY_S, SECOND_NS, Listener, broadcast_ids
 from emb_daemon.monitor.view import render, sparkline, summary
 from emb_daemon.plant.records import TRUTH
+from emb_daemon.resources import resource
 from emb_daemon.wire.contract import REASONS
 
 S = SECOND_NS
@@ -41,6 +43,14 @@ def _text(listener, now_ns=101 * S, width=80, height=24) -> list[str]:
     with console.capture() as capture:
         console.print(render(listener, now_ns, "can0", width, height))
     return capture.get().splitlines()
+
+
+def test_the_broadcasts_of_all_corners_are_listened_to():
+    """What authenticates them is for a receiver that has the key."""
+    database = cantools.database.load_file(resource("dbc/emb.dbc"))
+    sent = {message.name: message.frame_id for message in database.messages if "Estimator" in message.senders}
+    shown = [can_id for name, can_id in sent.items() if not name.endswith(("Auth", "Freshness"))]
+    assert len(shown) == 16 and sorted(broadcast_ids()) == sorted(shown)
 
 
 def test_every_signal_reaches_the_state():

@@ -11,11 +11,13 @@ import wirekit
 
 import emb_daemon
 from emb_daemon.cli.main import main
+from emb_daemon.cli.options import load_chosen
 from emb_daemon.logs import read
 from emb_daemon.logs.candump import format_candump
 from emb_daemon.logs.columns import Decoder
 from emb_daemon.offline.score import temperature_figures
 from emb_daemon.replay import Replay
+from emb_daemon.resources import resource
 
 _ANGLE = np.concatenate([np.linspace(0.0, 12.0, 200), np.linspace(12.0, 0.0, 200)])
 _SPEED = np.gradient(_ANGLE, 0.004)
@@ -172,3 +174,12 @@ def test_each_log_is_read_once(two_corners, monkeypatch, capsys):
     assert reads == {"FL_RR.log": 1, "FL.log": 1}
     _table(two_corners / "FL_RR.log", "--corner", "all", output=out)
     assert reads["FL_RR.log"] == 2
+
+
+def test_the_calibration_that_is_named_is_the_one_that_is_used(tmp_path):
+    named = tmp_path / "calibration.yaml"
+    named.write_text(
+        resource("config/calibration.yaml").read_text().replace("pad_thickness_mm: 10.0", "pad_thickness_mm: 7.0")
+    )
+    assert load_chosen(named).pad_thickness_mm == 7.0
+    assert load_chosen(None).pad_thickness_mm == 10.0

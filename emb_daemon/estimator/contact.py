@@ -144,7 +144,7 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
     load = mean_force + s.spring_force
     to_torque(h, leverage, slope, s.friction_mean, load, speed, slow, accelerating, needed, s.winding, s.housing)
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
-    # No force needs more; a single sample beyond it then stays a fifteenth of what counts as a clamp.
+    # No force needs more. A single sample that is beyond it then leaves a fifteenth in the mean, less than counts as a clamp.
     largest = leverage * p.maximum_force
     torque = min(max(torque - learned, -largest), largest)
     offset, offset_sigma = s.error[OFFSET], sqrt(s.covariance[OFFSET, OFFSET])

@@ -15,9 +15,9 @@ from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 #: what a contact angle jumps by at once), is no motion.
 SPEED_MARGIN = 1.2
 _ANGLE_MARGIN = 0.5
-#: Shares of the largest speed. No motor gains the first within a cycle, nor does a log that is interpolated from 100 Hz. An
-#: angle goes on as before within the second of the last speed: one that had gained so much would have by half of it. Nothing
-#: turns at the third, whatever voltage and field.
+#: Shares of the largest speed: what no motor gains within a cycle, as it would be at full speed within 8 ms, and no log that
+#: is interpolated from 100 Hz; how far the angle may move beside the last speed and still go on as before, as one that had
+#: gained the first would not: by half of that; and what nothing turns at, whatever voltage and field.
 _GAINED, _AS_BEFORE, _NO_SPEED = 0.5, 0.2, 2.0
 #: Travel in one sample, rad, beyond what the speed accounts for, that counts as a jump of the zero, in addition to a delay of
 #: this many seconds between both: 12 turns a second without speed. Standard deviation of such a jump, rad.
