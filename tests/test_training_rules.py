@@ -10,8 +10,9 @@ from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, Evaluation,
 from emb_daemon.adapt.memory import entry_of
 from emb_daemon.calibration.parameters import CLEARANCE, value_of
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.hypotheses import DRIFT
+from emb_daemon.estimator.hypotheses import DRIFT, PRIOR_ODDS, STIFFNESS_JUMP
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, new_state
+from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -600,6 +601,42 @@ def test_a_curve_that_did_not_change_leaves_what_driving_knew():
     assert state["contact_angle"] + drift["error"][CONTACT] == pytest.approx(expected)
     assert drift["covariance"][CONTACT, CONTACT] == pytest.approx(1.0 / (1.0 / known + 1.0 / a["contact_sigma"] ** 2))
     assert drift["covariance"][FAST, FAST] == 1.0 and not drift["error"][LOAD]
+
+
+def _known_to(sigma, drift_sigma, jump_odds, drift_odds):
+    """STATE and PARAMETERS of a filter that knows its contact angle to ``sigma`` rad, and with these odds to be wrong."""
+    state, p = new_state()[0], np.zeros(1, PARAMETERS)[0]
+    p["gear_gain"] = 4e-5
+    state["covariance"][CONTACT, CONTACT] = sigma**2
+    state["alternatives"]["log_odds"] = PRIOR_ODDS
+    state["alternatives"]["log_odds"][STIFFNESS_JUMP] = jump_odds
+    state["alternatives"]["log_odds"][DRIFT] = drift_odds
+    state["alternatives"]["covariance"][DRIFT, CONTACT, CONTACT] = drift_sigma**2
+    return state, p
+
+
+@pytest.mark.parametrize(("jump_odds", "drift_odds"), [(PRIOR_ODDS, -2.0), (-3.0, -0.7), (2.0, -2.0)])
+def test_a_stroke_that_contradicts_driving_is_believed_by_what_may_have_happened(jump_odds, drift_odds):
+    """Of brakes of which as many have jumped, or drift, as the odds say, those whose stroke contradicts the filter have the
+    errors that are stated of them, which are smaller than those of either alone."""
+    rng, count, known, seen = np.random.default_rng(8), 200_000, 0.02, 0.1
+    state, p = _known_to(known, 0.3, jump_odds, drift_odds)
+    odds = np.exp([0.0, jump_odds, drift_odds])
+    sigma = np.array([known, np.hypot(known, contact_jump(p)), 0.3])[rng.choice(3, count, p=odds / odds.sum())]
+    truth = sigma * rng.standard_normal(count)
+    moved = truth + seen * rng.standard_normal(count)
+    apart = np.flatnonzero(np.abs(moved) > 2.0 * np.hypot(known, seen))[:20_000]
+    combined = np.array([training._combine(state, p, moved[i], seen**2) for i in apart])
+    error = combined[:, 0] - truth[apart]
+    assert np.mean(error**2) == pytest.approx(np.mean(combined[:, 1]), rel=0.05)
+    weighed = known**2 / (known**2 + seen**2) * moved[apart] - truth[apart]
+    assert np.mean(error**2) < min(np.mean(weighed**2), np.mean((moved - truth)[apart] ** 2))
+
+
+def test_a_stroke_that_agrees_with_driving_costs_it_nothing():
+    state, p = _known_to(0.02, 0.3, PRIOR_ODDS, -2.0)
+    shift, left = training._combine(state, p, 0.2, 0.01)
+    assert (shift, left) == pytest.approx((0.2 * 4e-4 / 0.0104, 4e-4 * 0.01 / 0.0104))
 
 
 def test_a_new_curve_is_known_as_the_stroke_knows_it():

@@ -11,7 +11,7 @@ from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row, forget_contested
 from emb_daemon.estimator.common import forget_common, weigh_common
-from emb_daemon.estimator.hypotheses import DRIFT, open_all, open_changes
+from emb_daemon.estimator.hypotheses import DRIFT, drift_share_odds, jump_odds, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.restart import SNAPSHOT_S
@@ -32,6 +32,9 @@ _MOTION_RAD, _STILL_S = 0.3, 3.0
 #: Time constant of the smoothed torque force, the share of the high force below which the pads count as released, and the
 #: time over which collecting goes on after a full stroke.
 _SMOOTHING_S, _LOW, _TAIL_S = 0.25, 0.04, 1.0
+#: Standard deviations within which a stroke's contact angle agrees with the filter's: 95 % of those of a brake that is as it
+#: was, which thus pays nothing for the others.
+_AGREE = 2.0
 #: States of the motor and its current sensor.
 _OF_THE_MOTOR = (GAIN, OFFSET, FADE, HOUSING, INERTIA)
 #: Reasons that prevent or end training: what it learns from is missing or doubted.
@@ -172,6 +175,30 @@ def _reset_fitted(x, P):
 
 
 @njit
+def _combine(s, p, moved, variance):
+    """How far the contact angle moves when a stroke has found it ``moved`` rad from the filter's, with this ``variance``, and
+    the variance that is left, rad^2.
+
+    Where both agree they are weighed by their variances. Otherwise three brakes may have made the stroke: the filter's, one
+    whose contact has jumped since driving showed it, and one that drifts. Their odds are those that driving left, times the
+    likelihood of ``moved``; the result has the mean and the variance of the mixture."""
+    known, drift = s.covariance[CONTACT, CONTACT], s.alternatives[DRIFT]
+    if sq(moved) < sq(_AGREE) * (known + variance):
+        return known / (known + variance) * moved, known * variance / (known + variance)
+    # Of each brake: what it expects, how well, and with which odds.
+    expected = np.array([0.0, 0.0, drift.error[CONTACT]])
+    own = np.array([known, known + sq(contact_jump(p)), drift.covariance[CONTACT, CONTACT]])
+    log_odds = np.array([0.0, jump_odds(s), drift_share_odds(s)])
+    both, off = own + variance, moved - expected
+    log_odds -= 0.5 * (off * off / both + np.log(both))
+    odds = np.exp(log_odds - log_odds.max())
+    odds /= odds.sum()
+    shift = expected + own / both * off
+    mean = (odds * shift).sum()
+    return mean, (odds * (own * variance / both + (shift - mean) ** 2)).sum()
+
+
+@njit
 def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned: Record, a: Record) -> None:
     """Change from ``p`` to ``learned`` PARAMETERS and to the other results of the evaluation in ``a`` (ADAPTER).
 
@@ -179,14 +206,14 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     (`adapt.fit.reach`), over ``rows``, what has been collected since.
 
     If the curve is unchanged, driving has shown more of contact and stiffness than one stroke. The stroke's contact angle is
-    then combined with the filter's by their variances, unless the pads have moved, and the drift hypothesis keeps its odds."""
-    known, moved = s.covariance[CONTACT, CONTACT], a.contact_angle - s.contact_angle
+    then combined with the filter's (`_combine`), unless the pads have moved, and the drift hypothesis keeps its odds."""
+    moved = a.contact_angle - s.contact_angle
     kept = abs(moved) < contact_jump(p)
     for i in range(len(p.curve)):
         kept = kept and learned.curve[i] == p.curve[i]
-    weight = known / (known + sq(a.contact_sigma)) if kept else 1.0
+    shift, left = _combine(s, p, moved, sq(a.contact_sigma)) if kept else (moved, sq(a.contact_sigma))
     scale = s.scale if kept else 1.0
-    apart = s.contact_angle + weight * moved - reached.contact_angle
+    apart = s.contact_angle + shift - reached.contact_angle
     reached.contact_angle += apart
     reached.past_contact -= apart
     for i in range(len(rows)):
@@ -198,7 +225,7 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
     s.friction_state, s.friction_variance, s.slid_angle = reached.friction_state, reached.friction_variance, reached.slid_angle
     s.effects = reached.effects
     _reset_fitted(s.error, s.covariance)
-    s.covariance[CONTACT, CONTACT] = (1.0 - weight) * known if kept else sq(a.contact_sigma)
+    s.covariance[CONTACT, CONTACT] = left
     if not kept:
         # A new curve depends on the torque constant and the inertia of the stroke, and on how the motor had faded before it.
         since = (s.error[FADE] - a.fade) * s.winding + (s.error[HOUSING] - a.housing_fade) * s.housing
@@ -213,7 +240,7 @@ def apply_learned(s: Record, p: Record, reached: Record, rows: Records, learned:
         _reset_fitted(drift.error, drift.covariance)
         known = drift.covariance[CONTACT, CONTACT]
         share = known / (known + sq(a.contact_sigma))
-        drift.error[CONTACT] += share * (moved - drift.error[CONTACT]) - weight * moved
+        drift.error[CONTACT] += share * (moved - drift.error[CONTACT]) - shift
         drift.covariance[CONTACT, CONTACT] = (1.0 - share) * known
         open_changes(s, learned)
     else:

@@ -291,9 +291,23 @@ def _strongest(s, but):
 
 
 @njit
+def jump_odds(s: Record) -> float:
+    """Log odds of the likeliest jump of the stiffness path."""
+    kept = s.alternatives[KEPT_JUMP]
+    new = s.alternatives[STIFFNESS_JUMP].log_odds
+    return max(new, kept.log_odds) if kept.kind == STIFFNESS_JUMP else new
+
+
+@njit
 def _likeliest_odds(s):
     """Log odds of the likeliest of all but a drift."""
     return max(_strongest(s, DRIFT), 0.0)
+
+
+@njit
+def drift_share_odds(s: Record) -> float:
+    """Log odds of a drift, by which it has its share: at most half as likely as the likeliest hypothesis."""
+    return min(s.alternatives[DRIFT].log_odds, _likeliest_odds(s) + _DRIFT_MOST)
 
 
 @njit
@@ -304,7 +318,7 @@ def _share_out(s):
         total += exp(s.alternatives[kind].log_odds)
     for kind in range(DRIFT):
         s.alternatives[kind].share = exp(s.alternatives[kind].log_odds) / total
-    drifts = exp(min(s.alternatives[DRIFT].log_odds, _likeliest_odds(s) + _DRIFT_MOST))
+    drifts = exp(drift_share_odds(s))
     s.alternatives[DRIFT].share = drifts / (total + drifts)
 
 
