@@ -277,6 +277,7 @@ def test_a_current_that_repeats_five_times_while_the_motor_turns_is_at_its_senso
     """And is not believed there, on either side, until it goes beyond; one that hardly flickered may just be coarse."""
     w = Watched()
     w.pass_by(60, speed=100.0)
+    w.pass_by(1, speed=100.0, current=9.05)
     assert w.pass_by(5, speed=100.0, current=9.0) == AGREE
     assert w.pass_by(1, speed=100.0, current=9.0) == TORQUE_FROZEN and w.c["limit"][0] == 9.0
     assert w.pass_by(1, speed=100.0, current=3.0) == AGREE and w.c["limit"][0] == 9.0
@@ -288,11 +289,22 @@ def test_a_current_that_repeats_five_times_while_the_motor_turns_is_at_its_senso
     assert new.c["limit"][0] == 0.0
 
 
+def test_at_the_largest_current_so_far_three_repetitions_are_enough():
+    """A motor that is asked to turn needs much current for some cycles only."""
+    w = Watched()
+    w.pass_by(60, speed=100.0)
+    assert w.pass_by(3, speed=100.0, current=-9.0) == AGREE and w.c["limit"][0] == 0.0
+    assert w.pass_by(1, speed=100.0, current=-9.0) == TORQUE_FROZEN and w.c["limit"][0] == 9.0
+    w.pass_by(1, speed=100.0, current=12.0)
+    assert w.pass_by(4, speed=100.0, current=11.0) == AGREE and w.c["limit"][0] == 0.0
+
+
 def test_a_current_that_repeats_while_the_motor_hardly_turns_has_no_limit():
     w = Watched()
     w.pass_by(60, speed=100.0)
     w.pass_by(10, speed=1.0, current=9.0)
     assert w.c["limit"][0] == 0.0
+    w.pass_by(1, speed=100.0, current=9.05)
     for _ in range(4):
         w.pass_by(4, speed=100.0, current=9.0)
         w.pass_by(1, speed=1.0, current=9.0)

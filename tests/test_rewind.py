@@ -10,7 +10,7 @@ from emb_daemon.estimator.contact import place_contact
 from emb_daemon.estimator.hypotheses import PRIOR_ODDS, STIFFNESS_JUMP, TORQUE_JUMP
 from emb_daemon.estimator.paths import shift_zero
 from emb_daemon.estimator.records import new_state
-from emb_daemon.estimator.rewind import STOPS, go_back, keep, keep_all
+from emb_daemon.estimator.rewind import STOPS, forget_stroke, go_back, keep, keep_all
 from emb_daemon.models.fusion import CONTACT, CREEPS, OFFSET, SCALE, VISCOUS
 from emb_daemon.offline import estimate
 
@@ -150,3 +150,45 @@ def test_a_training_is_not_gone_back_from(kept):
     _learn(trained, 1.0)
     go_back(trained, learned)
     assert _known(trained) == pytest.approx(known)
+
+
+def _step_through_clearance(p):
+    """Angles of a motor that jumps through most of the clearance after a second at rest, and later clamps slowly, with a
+    sinusoid on top."""
+    t, way, acceleration = 0.004 * np.arange(6000), 0.9 * p["clearance"], 5000.0
+    speeding = np.sqrt(0.5 * way / acceleration)
+    gained = np.clip(t - 1.0, 0.0, speeding)
+    braking = acceleration / 3.0
+    left = np.clip(t - 1.0 - speeding, 0.0, acceleration * speeding / braking)
+    step = 0.5 * acceleration * gained**2 + acceleration * speeding * left - 0.5 * braking * left**2
+    s = np.clip(t - 3.0, 0.0, 20.0)
+    return step + 10.0 * (1.0 - np.cos(0.1 * np.pi * s)) + 0.9 * np.sin(10.0 * np.pi * s)
+
+
+@pytest.mark.parametrize("limit_A", [2.0, 3.0, 5.0])
+def test_a_current_sensor_that_ends_early_teaches_nothing_in_its_first_stroke(parameters, limit_A):
+    """What accelerated the motor beyond the sensor's limit had passed for an offset of the current, then for a contact in the
+    clearance: up to 13 kN, and a tenth of the samples running."""
+    p = brake.ideal(parameters)
+    samples, force = brake.samples(p, _step_through_clearance(p))
+    samples = brake.noisy(samples, p)
+    np.clip(samples["current_q"], -limit_A, limit_A, out=samples["current_q"])
+    estimates = estimate(samples, p)
+    error = (estimates["force"] - force)[25:]
+    assert np.max(np.abs(error)) < 150.0
+    assert np.all(np.abs(error) < 3.0 * np.hypot(estimates["sigma"][25:], 25.0))
+
+
+def test_of_a_stroke_that_is_forgotten_the_stops_before_are_kept(s, parameters):
+    """The offset of the current too is what it was; later faults can still go back further."""
+    _learn(s, 1)
+    keep(s)
+    before, offset = _known(s), float(s["error"][OFFSET])
+    earlier = s["learned"].copy()
+    _learn(s, 2)
+    s["error"][OFFSET] += 0.1
+    s["alternatives"]["log_odds"] = 9.0
+    forget_stroke(s, brake.ideal(parameters))
+    assert _known(s) == pytest.approx(before) and s["error"][OFFSET] == offset
+    assert np.all(s["alternatives"]["log_odds"] < 0.0)
+    assert np.array_equal(s["learned"], earlier)

@@ -57,18 +57,30 @@ def keep(s: Record) -> None:
 @njit
 def go_back(s: Record, p: Record) -> None:
     """Know what was known some stops ago, and suspect nothing."""
-    a = s.learned[0]
     # Neither a delay nor a filter changes what the clearance shows of the offset.
     offset, variance = s.error[OFFSET], s.covariance[OFFSET, OFFSET]
-    copy_errors(s.error, s.covariance, a.error, a.covariance)
+    _know(s, s.learned[0])
     for i in range(STATES):
         s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
     s.error[OFFSET], s.covariance[OFFSET, OFFSET] = offset, variance
+    keep_all(s)
+    open_all(s, p)
+
+
+@njit
+def forget_stroke(s: Record, p: Record) -> None:
+    """Know what was known at the end of the last stop, and suspect nothing."""
+    _know(s, s.learned[STOPS - 1])
+    open_all(s, p)
+
+
+@njit
+def _know(s, a):
+    """Know no more than ``a``, a LEARNED record."""
+    copy_errors(s.error, s.covariance, a.error, a.covariance)
     s.error[CONTACT], s.error[SCALE] = a.contact_angle - s.contact_angle, a.scale / s.scale - 1.0
     s.error[GROWTH] = a.growth - s.growth
     for i in range(len(CREEPS)):
         s.error[CREEPS[i]] = a.creep[i] - s.creep[i]
     fold(s, disc_warmth(s), True)
     s.jumps, s.contact_walk, s.contact_age_s = a.jumps, a.contact_walk, 0.0
-    keep_all(s)
-    open_all(s, p)

@@ -18,7 +18,7 @@ from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
 from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
 from emb_daemon.estimator.resolver import SPEED_MARGIN, at_rest, believe_speed, follow_zero
-from emb_daemon.estimator.rewind import go_back, keep_all
+from emb_daemon.estimator.rewind import forget_stroke, go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
     BOUND_REACHED,
@@ -153,8 +153,11 @@ def _advance(s, p, m, angle, speed, out):
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         sigma = sqrt(s.covariance[CONTACT, CONTACT])
         # What stands in for a speed does not flicker.
-        before = np.nan if s.speed_wrong else s.speed
+        before, limit = np.nan if s.speed_wrong else s.speed, s.plausibility.limit
         watch(s.plausibility, m, s.angle, before, turned, s.past_contact, sigma, s.contact.confirmed)
+        if s.plausibility.limit > 0.0 and limit == 0.0 and p.clearance_sigma > 0.0:
+            # The stroke's current up to here was less than what flowed.
+            forget_stroke(s, p)
     other_speed = _follow_age(s, p, m, turned, moved_zero)
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)

@@ -18,16 +18,17 @@ import numpy as np
 
 from emb_daemon.jit import Record, fields, hypot, njit
 
-#: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in
-#: which angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
+#: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
+#: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``steady``: the same less what
 #: accelerates the motor. The angle has stood at ``held_angle`` (rad) for ``held`` samples; meanwhile ``steady`` swung
 #: ``swings`` times, the last time upwards (``swing`` 1) or downwards (-1); ``held_low``, ``held_high``: its least and largest
 #: value since the last swing. ``pinned``: samples in a row in which the current repeated to the bit while the motor turned;
-#: ``limit`` A: of either sign, as far as its sensor then goes, 0 if unknown. ``due_acceleration`` (rad/s²), ``due_speed``
-#: (rad/s), ``due_angle`` (rad): motion that the torque must have caused since the angle stands.
+#: ``limit`` A: of either sign, as far as its sensor then goes, 0 if unknown; ``largest`` A: of either sign, so far.
+#: ``due_acceleration`` (rad/s²), ``due_speed`` (rad/s), ``due_angle`` (rad): motion that the torque must have caused since the
+#: angle stands.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -38,7 +39,7 @@ PLAUSIBILITY = np.dtype(
         ("averaged", "?"),
         *fields("f8", "torque_mean torque_variance steady held_angle held_low held_high due_acceleration due_speed due_angle"),
         *fields("i8", "held swing swings pinned"),
-        ("limit", "f8"),
+        *fields("f8", "limit largest"),
     ],
     align=True,
 )
@@ -72,8 +73,9 @@ _CERTAIN, _SURELY = 10.0, 3.0
 #: friction that may turn over within it, over the calibration's.
 _STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
 #: Samples of a motor that turns in which the current repeats to the bit: its sensor goes no further. By chance, at one
-#: repetition in five, once in 3000.
-_PINNED = 5
+#: repetition in five, once in 3000; at the largest current so far fewer are as rare, and a motor that is asked to turn needs
+#: that for some cycles only.
+_PINNED, _PINNED_AT_LARGEST = 5, 3
 #: Angle by which the torque must have turned the motor, rad, to contradict an angle that stands: eight times what a motor
 #: would get that turns back between two samples, if it were taken to start from rest. Torque beyond friction that noise may
 #: cause, in standard deviations: one sample of 700 has more, and three in a row are needed.
@@ -152,7 +154,9 @@ def _look_for_limit(c, current, travel):
     """Learn the limit of the current sensor: a ``current`` (A) that repeats while the motor turns. At the limit as much flows,
     or more. A limit that the current exceeds was none."""
     c.pinned = c.pinned + 1 if c.idle > 0 and abs(travel) > _STANDS_RAD else 0
-    if c.pinned >= _PINNED and c.current_flickered >= _FLICKERED:
+    needed = _PINNED if abs(current) < c.largest else _PINNED_AT_LARGEST
+    c.largest = max(c.largest, abs(current))
+    if c.pinned >= needed and c.current_flickered >= _FLICKERED:
         c.limit = abs(current)
     elif abs(current) > c.limit:
         c.limit = 0.0
