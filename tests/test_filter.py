@@ -313,3 +313,22 @@ def test_a_torque_that_may_be_off_says_less_of_the_force_alone(parameters):
     alone = (without["source"] == TORQUE_ONLY) & (stated["source"] == TORQUE_ONLY)
     assert alone.sum() > 300 and stated["force"][alone].max() > 5000.0
     assert stated["sigma"][alone] == pytest.approx(np.hypot(without["sigma"][alone], 0.2 * stated["force"][alone]), rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_at_a_reduced_rate_a_motor_that_turns_back_unseen_is_no_change_of_the_brake(parameters, seed):
+    """Samples ten times a second show neither its arrival nor that friction has turned over: half of the friction was taken
+    for other pads, 400 to 540 N where the stiffness path alone had 14 N."""
+    p = brake.ideal(parameters)
+    hold, back = p["clearance"] + 6.0, 0.02
+    ramp = 0.5 * (1.0 - np.cos(np.pi * np.arange(75) / 75))
+    settling = hold - back * 0.5 * (1.0 - np.cos(np.pi * np.arange(10) / 10))
+    cycle = [hold * ramp, settling, np.full(7500, hold - back), (hold - back) * (1.0 - ramp), np.zeros(1250)]
+    samples, force = brake.samples(p, np.concatenate([np.zeros(250), *12 * cycle]))
+    samples, force = brake.noisy(samples, p, seed)[::25].copy(), force[::25]
+    samples["dt"][1:] = 0.1
+    estimates = estimate(samples, p)
+    clamped = force > 1000.0
+    error = (estimates["force"] - force)[clamped]
+    assert np.sqrt(np.mean(error**2)) < 120.0
+    assert np.all(np.abs(error) < 2.0 * estimates["sigma"][clamped])

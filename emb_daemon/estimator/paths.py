@@ -261,6 +261,9 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     )
     if s.past_contact > 0.0:
         s.friction_variance = turned_unseen(s.friction_variance, _unseen(s, p, m), p.presliding_angle)
+        if m.dt > ONE_CYCLE_S:
+            # Over a gap nobody saw whether the motor went to and fro.
+            s.friction_variance = 1.0
     if s.straying.creeps and slid != 0.0 and s.past_contact < 0.0:
         # Nor is it known whether an angle that moves while the speed, now and of late, shows nothing has slid it: nothing
         # drives the motor of an open brake, while that of a closed one follows pads and disc.
