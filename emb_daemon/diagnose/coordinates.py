@@ -128,7 +128,8 @@ _CLEARANCE_RAD = 0.5
 HISTORY_TIME = "thermal.softening.history_time_s"
 #: Pads soften with heat, never stiffen: what was calibrated holds within a third or this, and never beyond the most, 1/K.
 _SOFTENING, _MOST_SOFTENING = 1e-4, 2e-3
-#: Phase runs away with the angle: an order is only ever touched up. Step and standard deviation, per turn.
+#: Step and standard deviation of a harmonic's order, per turn. Both are small, because over many turns a small change of the
+#: order turns the phase by much.
 _ORDER_STEP, _ORDER = 1e-4, 0.1
 #: Standard deviation of an effect's shape, at least; over its size where that is larger.
 _SHAPE = 0.5

@@ -206,7 +206,7 @@ def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[
                 form = Form(port, signal, memory, shape, "always", scale, middle, exponent, time, low, high, other, most)
                 straight = shape != "onset" and exponent == 1.0
                 found += [form] if memory == "response" or not straight else []
-                # Of the plain product once is enough.
+                # The product of two signals, neither shaped, is the same in both orders: once is enough.
                 found += [replace(form, straight=True)] if straight and signal < other else []
     return found
 
@@ -251,7 +251,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     centre = _COLD_C if signal in _TEMPERATURES else 0.0
     farthest = max(abs(low - centre), abs(high - centre))
     if HOOKS[port].channel == "temperature":
-        # Temperatures remember by themselves.
+        # Temperatures are lagged already: no further memory.
         yield from (("none", "odd_power", farthest, centre, exponent, 1.0) for exponent in _EXPONENTS)
         yield from (("none", "decay", share * reach, 0.0, 1.0, 1.0) for share in _SCALES)
         yield from (("none", "onset", width, low + place * width, 1.0, 1.0) for place in _PLACES)
@@ -283,7 +283,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         for time in _TIMES_S:
             yield "lag", "odd_power", farthest, centre, 1.0, time
     if signal in ("disc_speed", "brake_torque", "friction_power", "clamp_force"):
-        # Of the power one a response is the lag of above.
+        # A response to the first power of a signal is the lag above.
         yield from _responses(reach, (2.0,))
         for time in _TIMES_S:
             for place in _PLACES:

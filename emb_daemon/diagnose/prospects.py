@@ -257,14 +257,14 @@ class Search:
         for number in range(CHANCES):
             shift = int(len(values) * self.random.uniform(0.1, 0.9))
             if any(float(screen.scores_of(does * np.roll(own, shift, axis=0)).gain.max()) >= gain for does, own in by_port):
-                # One that is as good is one too many, and settles it.
+                # One maximum that is as good already exceeds the level: no need to go on.
                 return 2.0 / (2.0 + number)
         return 1.0 / (1.0 + CHANCES)
 
     def at_another_time(self, form: Form) -> float:
         """Gain of a term with its signal moved in time, as if the log were a circle, the median of a few; none for a ripple.
 
-        Not by the largest: what rises once and stays is, moved by a little, still much of itself."""
+        The median, not the largest: a signal that rises once and stays is nearly the same when moved by a little."""
         return 0.0 if form.shape == "harmonic" else float(np.median(self.gains_moved(form)))
 
     def gains_moved(self, form: Form) -> np.ndarray:
