@@ -154,13 +154,13 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
             result.append(scaled_coordinate(calibration, keys, "stiffness", _CURVE))
     for name in ("per_K", "history_per_K"):
         known = parameter(calibration, f"thermal.softening.{name}")
-        # Of what no log has shown yet only the usual size is known.
+        # A softening of zero was never identified: its prior is the usual size.
         prior = max(abs(known.value) / 3.0, _SOFTENING) if known.value else _usual(known.step)
         move = (Move(known.key, 1.0, 0.0, _MOST_SOFTENING),)
         low, high = min(0.0, known.value), max(_MOST_SOFTENING, known.value)
         result.append(Coordinate(known.key, "stiffness", known.value, known.step, prior, move, low, high, known.unit))
     if not calibration.thermal.softening.history_per_K:
-        # No log has shown it yet.
+        # No log has shown the history's time constant yet.
         result.append(scaled_coordinate(calibration, [HISTORY_TIME], "stiffness", 1.0))
     for key, channel, prior in _BASE:
         coordinate = scaled_coordinate(calibration, [key], channel, _STATED if stated and key == TORQUE_CONSTANT else prior)

@@ -59,8 +59,8 @@ _GATES: dict[str, tuple[str, ...]] = {
     "torque": ("always", "load", "closing", "opening"),
     "gear_friction": ("always", "load", "closing", "opening"),
 }
-#: Ports at which two signals may multiply: factors and lengths. What counts from the power on multiplies nothing, and places
-#: along the screw are asked by bumps.
+#: Ports at which two signals may multiply: factors and lengths. Signals in `_ALONE` are not multiplied: those that count from
+#: power-on have no physical zero, and dependence on the place along the screw is covered by bumps.
 _MULTIPLIED = (
     "thickness", "stiffness", "torque_constant", "relaxation_time", "gear_gain", "gear_friction", "heat_share",
     "contact_conductance", "disc_cooling",
@@ -240,8 +240,9 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
                 yield "none", "bump", share * width, float(place), 1.0, 1.0
         return
     if port == "torque_constant" and signal == "current":
-        # As it is: through a lag it would not saturate when the motor accelerates, and a gear gain over the force would seem
-        # as good. The residual of the torque path is current itself, but the constant's own column takes that shadow.
+        # The current itself, not lagged: saturation shows while the motor accelerates, and lagged the term would look like a
+        # gear gain over the force. That the torque path's residual is a current itself does no harm, because the column of the
+        # constant takes up what both share.
         for exponent in _EXPONENTS:
             yield "none", "even_power", reach, 0.0, exponent, 1.0
         yield from _responses(reach)
@@ -261,7 +262,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
             yield "deficit", "odd_power", reach, 0.0, 1.0, time
         return
     if signal == "clamp_force" and port in ("thickness", "stiffness"):
-        # A curve is the calibration's own; what depends on the way there is not.
+        # A function of the force alone is the calibration's curve; what is looked for is how the force was reached.
         for share in _SLIPS:
             yield "slip", "odd_power", 1.0, 0.0, 1.0, share * width
         for time in _CREEP_S:

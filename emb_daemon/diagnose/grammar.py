@@ -319,8 +319,8 @@ def _is_longer(found: Selection, selection: Selection, channel: str) -> bool:
 
 
 def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
-    """Those that gain as much as the first, beginning with what most resampled episodes choose: which of them gains a little
-    more is chance. Then what gains less, but is chosen by enough of these."""
+    """Prospects that gain as much as the first (`AS_GOOD`), ordered by how many bootstraps choose them, because small
+    differences in gain are chance; then those that gain less but are chosen by enough bootstraps (`_RIVAL`)."""
     least = AS_GOOD * prospects[0].evidence.gain
     equal = sorted((p for p in prospects if p.evidence.gain >= least), key=lambda p: -shares[p.means])
     return [*equal, *(p for p in prospects if p.evidence.gain < least and shares[p.means] >= _RIVAL)]

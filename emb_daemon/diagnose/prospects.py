@@ -449,7 +449,7 @@ def _order(search: Search, port: str, order: float) -> float:
         u = columns.T @ screen.residual[:, 0]
         return float(u @ np.linalg.pinv(columns.T @ columns, hermitian=True) @ u)
 
-    # Of all places together a lobe is as wide as this.
+    # Width of a spectrum's lobe over the whole range of angles.
     lobe = 2.0 * np.pi / max(high - low, 1.0)
     tried = (order + lobe * np.linspace(-0.5, 0.5, 2 * _TRIES + 1)).tolist()
     return max((o for o in tried if o > 0.0), key=gain)

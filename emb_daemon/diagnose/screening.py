@@ -133,8 +133,8 @@ class Screening:
     def floor(self, model: Model, channel: str, made: bool = False) -> float:
         """Least RMS of an effect that matters, or of the heat balance of a term that is ``made``, in the channel's unit.
 
-        A term of the heat balance has a lower limit, because its gain is what remains beside all that heat capacities and
-        conductances can do in these logs: that may be a fifth of what the term does in the next."""
+        A term of the heat balance has a lower limit, because its gain is only what heat capacities and conductances cannot
+        make up for in these logs, which may be a fifth of what it does in the next."""
         if channel == "temperature" and not made:
             return _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE

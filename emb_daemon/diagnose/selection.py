@@ -351,8 +351,9 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
                 float(ttest_1samp(fall, 0.0, alternative="greater").pvalue),
             )
         little = gain < floor
-        # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter, and they must
-        # agree; and so must what is gained where a prior alone says how large it is.
+        # A term that is above chance over the whole grammar may rest on few episodes, but its gain must matter and its
+        # amplitude be clear of zero. An effect that gains too little to matter stays only if it is clear of zero with its
+        # prior's share included.
         by_chance = unclear if over_grammar else chance > Q_VALUE
         if (
             gain <= 0.0
@@ -366,14 +367,14 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
 
 
 def _is_unclear(evidence: Evidence) -> bool:
-    """Whether amplitudes are not clear of nothing by how episodes scatter: a term that one hot episode carries may be the best
-    of the whole grammar, and be as good as nothing in the others."""
+    """Whether amplitudes are within `_CARRIED` standard deviations (jackknife over episodes) of zero: a term that rests on one
+    hot episode may be the best of the whole grammar, and zero in all others."""
     return bool(np.square(evidence.values / evidence.sigmas).sum() < _CARRIED**2 * len(evidence.values))
 
 
 def _is_carried(model: Model, group: Sequence[Coordinate]) -> bool:
-    """Whether amplitudes are clear of nothing by their standard deviations, their priors' share of which evidence over
-    episodes does not hold."""
+    """Whether amplitudes are beyond `_CARRIED` standard deviations from zero, by the fit's covariance: the jackknife over
+    episodes lacks the priors' share of it."""
     values = np.array([model.values[c] for c in group])
     covariance = model.fits[group[0].channel].block(group)
     known = bool(np.isfinite(covariance).all())
