@@ -133,13 +133,10 @@ class Trial:
         found: effects accepted, with their parameters.
         changed: effects of the calibration that are not as calibrated.
         before, after: RMSE of the fused force on the validation log, N.
-        unexplained: signal that a rest depends on, or None.
-        contribution_error: of what the found effects do on their paths against what the hidden ones do, RMS over RMS; None
-            where not exactly those were found.
-        seconds: of CPU, for diagnose alone.
-        left: by path; none in files of earlier versions.
-        kelvin: RMS of the temperatures' residual on the validation log, before and after.
-        alike: by term, what the report names as equally likely, as terms' names.
+        unexplained: signal on which an unexplained residual depends, or None. contribution_error: of what the found effects do
+        on their paths against what the hidden ones do, RMS over RMS; None where not exactly those were found. seconds: of CPU,
+        for diagnose alone. left: by path; none in files of earlier versions. kelvin: RMS of the temperatures' residual on the
+        validation log, before and after. alike: by term, what the report names as equally likely, as terms' names.
     """
 
     seed: int
@@ -242,7 +239,7 @@ def scaled(name: str, values: dict[str, float], factor: float) -> dict[str, floa
 
 
 def draw_foreign(rng: np.random.Generator, family: Mapping[str, tuple[str, ...]] = _FAMILY) -> dict[str, dict[str, float]]:
-    """An effect that nobody thought of, of size one."""
+    """An effect of a drawn port, signal or two, shape, exponent and lag, of size one."""
     port = list(family)[rng.integers(len(family))]
     signal = rng.choice(family[port])
     other = rng.choice(family[port]) if rng.uniform() < 1.0 / 3.0 else None
@@ -271,7 +268,8 @@ def draw_sized(
 
 
 def _sizing_bench(frames: np.ndarray, start: Calibration) -> Bench:
-    """What sizes are measured on: all samples, whatever of them the diagnosis judges, so that a seed stays the same brake."""
+    """Logs on which sizes are measured: by all samples, so that a seed draws the same brake whichever samples the diagnosis
+    judges."""
     bench = Bench([log_of(frames)], start)
     for trial in bench.trials:
         trial.yields[:] = False
@@ -369,7 +367,7 @@ def _draw_hidden(
 
 def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, ...] = (), size: float = 0.0, stops: int = 10):
     """One blind trial; ``kind`` is null, single, pair, triple, changed, foreign, drawn or heat, ``names`` the effects to hide
-    at ``size`` N (K of heat) each; for a change that of what the calibration says is off."""
+    at ``size`` N (K of heat) each; of a changed effect the size by which the calibration is wrong."""
     rng = np.random.default_rng(seed)
     removed = [name for name in names if name in calibration.effects]
     kept = {name: values for name, values in calibration.effects.items() if name not in removed}
@@ -464,7 +462,7 @@ def _amplitudes(values: dict[str, float]) -> dict[str, float]:
 def plan(
     null: int, single: int, pairs: int, foreign: int, drawn: int = 0, triples: int = 0, changed: int = 0, heat: int = 0
 ) -> list[tuple[int, str, tuple[str, ...], float]]:
-    """Trials (seed, kind, effects, size); ``single`` counts per effect and size. More of them begin with the same ones."""
+    """Trials (seed, kind, effects, size); ``single`` counts per effect and size. Larger counts begin with the same trials."""
     rng = np.random.default_rng(2009)
     names = list(DRAWN)
     trials: list[tuple[int, str, tuple[str, ...], float]] = [(1000 + k, "null", (), 0.0) for k in range(null)]

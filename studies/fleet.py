@@ -2,9 +2,9 @@
 
 Units scatter as well calibrated ones do. Three of five batches share one effect each, of 40 to 80 N RMS in contact, below what
 one car's diagnosis calls significant; ten single units have a fault of 120 to 250 N, or of six times what healthy units differ
-by; everybody's grease ages. A day is a drive
-of a quarter of a minute, three stops and a slow clamp, because 6 000 drives have to fit into minutes: a real day would say
-more. Nothing but the drives' samples and a table of unit and batch reaches the fleet's commands.
+by; the grease of all units ages. A day is a drive of a quarter of a minute, three stops and a slow clamp, because 6 000 drives
+have to fit into minutes: a real day would say more. Nothing but the drives' samples and a table of unit and batch reaches the
+fleet's commands.
 """
 
 import argparse
@@ -139,7 +139,7 @@ class Fleet:
         for name in rng.choice(list(_BATCHES), _HIDDEN, replace=False).tolist():
             batches[name] = draw_secret(rng, _BATCH_N, {secret.cause for secret in batches.values()})
         chosen = rng.choice(names, faulty, replace=False).tolist()
-        # A fault like the batch's own would only be more of it.
+        # A unit's fault of the same cause as its batch's effect could not be told from it.
         faults = {
             name: draw_secret(rng, _FAULT_N, {batches[batch[name]].cause} if batch[name] in batches else set())
             for name in chosen

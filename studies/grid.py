@@ -113,7 +113,7 @@ def draw_drive(
 
 
 def _join(faults: list[Fault]) -> Fault:
-    """All at once."""
+    """Several faults as one."""
     if len(faults) == 1:
         return faults[0]
 
@@ -146,7 +146,8 @@ def _join(faults: list[Fault]) -> Fault:
 
 
 class _Daemon:
-    """The daemon's own pipeline with adaptation, as often restarted as it takes; what it learned stays in its folder."""
+    """The daemon's own pipeline with adaptation, started anew at each restart of the drive; what it learned stays in its
+    folder."""
 
     def __init__(self, calibration, folder: Path):
         self._calibration, self._folder = calibration, folder

@@ -1,4 +1,5 @@
-"""One pad as the thesis computes it, to be compared with: explicit, surface hold, disc law once released (7.6, 8.1, 8.2)."""
+"""One pad as the thesis computes it, for comparison: explicit steps, a surface temperature that does not fall while braking
+and follows the disc once released (7.6, 8.1, 8.2)."""
 
 from math import ceil, exp
 

@@ -75,7 +75,7 @@ def _told(name: str, values: dict) -> str:
 
 @_family
 def foreign(rng, moments, size):
-    """From the start: the calibration was made before it entered."""
+    """An effect that no catalogue lists, there from the start of the drive; the calibration was made without it."""
     name, values = _foreign(rng)
     return Fault(_told(name, values), brake=effect(name, **values))
 
@@ -89,7 +89,7 @@ def foreign_sudden(rng, moments, size):
 
 @_family
 def foreign_grows(rng, moments, size):
-    """Over a minute."""
+    """An effect that no catalogue lists, growing over a minute."""
     (name, values), at = _foreign(rng), moments["go_1"]
 
     def car(car, time_s):
@@ -197,7 +197,7 @@ def stiction(rng, moments, size):
 
 @_family
 def cogging(rng, moments, size):
-    """Of a magnet that has moved or cracked, some hundredths of what the largest force asks of the motor."""
+    """Cogging torque of a magnet that has moved or cracked: some hundredths of the torque that the largest force needs."""
     torque, phase = size.current * draw_size(rng, 0.005, 0.05), float(rng.uniform(0.0, 6.3))
     order, at = float(rng.choice([1.0, 2.0, 6.0, 7.0, 12.0, 24.0, 36.0])), pick_sometime(rng, moments)
     parts = {"cosine_Nm": torque * np.cos(phase), "sine_Nm": torque * np.sin(phase), "order_per_turn": order}
@@ -239,7 +239,7 @@ def supply_sags(rng, moments, size):
 
 @_family
 def noise_grows(rng, moments, size):
-    """Of one sensor, from a cable's screen that has come off."""
+    """One sensor becomes noisier, as after its cable's screen has come off."""
     name = str(rng.choice(["current_noise", "speed_noise", "angle_noise"]))
     factor, at = draw_size(rng, 3.0, 30.0), pick_sometime(rng, moments)
     return Fault(f"{name} x {factor:.0f}", at, car=once(at, scale(factor, name)))
@@ -337,7 +337,7 @@ def current_gain_of_one_sign(rng, moments, size):
 
 @_family
 def current_remanence(rng, moments, size):
-    """The core keeps a share of the largest current until one of the other sign."""
+    """The sensor's core stays magnetised by a share of the largest current until one of the other sign flows."""
     share, at, state = draw_size(rng, 0.005, 0.05), moments["hold_1"], [0.0]
 
     def change(values, _):
@@ -372,14 +372,14 @@ def current_filtered(rng, moments, size):
 
 @_family
 def current_delayed(rng, moments, size):
-    """By another frame or a gateway than when it was calibrated."""
+    """The current comes up to 12 ms late, by another frame or gateway than at calibration."""
     delay = float(rng.uniform(0.001, 0.012))
     return Fault(f"{1e3 * delay:.1f} ms", brake=effect("current_delay", delay_s=delay))
 
 
 @_family
 def resolver_delayed(rng, moments, size):
-    """Angle and speed come with the next frame, or the one after it."""
+    """Angle and speed come one or two frames late."""
     cycles, at = int(rng.integers(1, 3)), pick_sometime(rng, moments)
 
     def delayed():
@@ -408,14 +408,14 @@ def angle_filtered(rng, moments, size):
 
 @_family
 def speed_filtered(rng, moments, size):
-    """By a tracking loop or firmware, which leave the angle as it is."""
+    """The speed goes through a filter of a tracking loop or of firmware; the angle does not."""
     seconds, at = draw_size(rng, 0.003, 0.03), pick_sometime(rng, moments)
     return Fault(f"{1e3 * seconds:.0f} ms", at, bus=during(alter(wire.RESOLVER, wire.MOTOR_SPEED, _low_pass(seconds)), at))
 
 
 @_family
 def resolver_cyclic(rng, moments, size):
-    """Its windings' amplitudes or phases have become unequal: an error of so many periods in a turn."""
+    """Amplitudes or phases of the resolver's windings have become unequal: an angle error of one or more periods a turn."""
     error, order, phase = draw_size(rng, 0.005, 0.06), float(rng.integers(1, 5)), float(rng.uniform(0.0, 6.3))
     at = pick_sometime(rng, moments)
     change = alter(wire.RESOLVER, wire.MOTOR_ANGLE, lambda values, _: values + error * np.sin(order * values + phase))
@@ -464,7 +464,7 @@ def wheel_speed_scaled(rng, moments, size):
 
 @_family
 def thermocouples_exchanged(rng, moments, size):
-    """One of the plates' with the caliper's."""
+    """The thermocouple of one backing plate is exchanged with the caliper's."""
     kept: dict[int, float] = {}
 
     def keep(column):
@@ -484,6 +484,6 @@ def thermocouples_exchanged(rng, moments, size):
 
 @_family
 def status_lost(rng, moments, size):
-    """The car's own status, with park brake and request."""
+    """The vehicle's status message, which has park brake and brake request, is lost."""
     at = pick_driving(rng, moments)
     return Fault("", at, bus=during(lose(wire.VEHICLE_STATUS), at))

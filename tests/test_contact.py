@@ -115,7 +115,8 @@ def test_a_current_that_steps_while_the_motor_of_an_open_brake_stands_is_no_cont
 @pytest.mark.parametrize("begin", [city.RELEASED, 1000, city.CLAMPING, city.HOLDING, city.SECOND_CLEARANCE])
 @pytest.mark.parametrize(("signal", "wrong"), [("current_q", 40.0), ("current_q", -40.0), ("speed", 30.0), ("speed", -30.0)])
 def test_a_single_sample_is_no_contact(signal, wrong, begin):
-    """Of a current as twice the largest force takes, or of a speed that the motor could just have gained: 10 kN before."""
+    """A current twice that of the largest force, or a speed that the motor could just have gained: taken for contact, either
+    costs 10 kN."""
 
     def change(samples):
         samples[signal][begin] += wrong

@@ -93,7 +93,7 @@ def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):
     find_known = grammar.find_known
 
     def misled(bare, channel):
-        """What gains more on a line that is far from all fits comes first, and describes it no better."""
+        """A wrong effect of the catalogue first, as if a linear test ranked it so; fitted it describes no more."""
         stribeck = [effect for effect in REGISTRY if effect.name == "stribeck_friction"]
         return [*bare.screening.test(bare.model, stribeck), *find_known(bare, channel)]
 
@@ -105,7 +105,7 @@ def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):
 
 
 def test_what_a_fit_has_left_at_nothing_is_no_effect(viscous):
-    """Its line may promise a gain that a bound, or what else was fitted, does not let it have."""
+    """A linear test may promise a gain that a bound, or the other fitted parameters, do not allow."""
     selection, _, _ = viscous
     [amplitude] = selection.model.of_effect("viscous_friction")
     stuck = dataclasses.replace(selection, model=selection.model.entered({amplitude: 1e-3 * amplitude.step}))
@@ -113,7 +113,7 @@ def test_what_a_fit_has_left_at_nothing_is_no_effect(viscous):
 
 
 def test_what_friction_does_as_it_turns_over_proves_no_effect(viscous, monkeypatch):
-    """How it does is a guess of every model: what an effect gains counts where the motor slides."""
+    """How friction turns over is modelled roughly: what an effect gains counts only where the motor slides."""
     selection, _, _ = viscous
     model = selection.without("viscous_friction", "to ask it again").model
     [viscous_friction] = [effect for effect in REGISTRY if effect.name == "viscous_friction"]
@@ -306,7 +306,7 @@ def test_what_most_logs_gain_does_not_outweigh_one_that_is_ruined(ruined, log):
 
 
 def test_what_only_its_prior_sizes_is_not_applied_unless_it_gains_what_matters(viscous, monkeypatch):
-    """Evidence over episodes knows nothing of how much a prior adds to what is not known."""
+    """The jackknife's covariance lacks the part of a standard deviation that comes from the prior."""
     selection = viscous[0]
     channel = selection.candidates["viscous_friction"].channel
     fit = selection.model.fits[channel]
@@ -320,7 +320,7 @@ def test_what_only_its_prior_sizes_is_not_applied_unless_it_gains_what_matters(v
 
 
 def test_a_path_that_is_no_number_any_more_has_got_worse():
-    """What an effect leaves without a value would else not count in the error."""
+    """Samples that lose their value would otherwise drop out of the error."""
     episode = np.repeat(np.arange(4), 100)
     errors = {"fused": np.full(400, 10.0), "torque": np.full(400, 10.0)}
     before = EpisodeErrors.of(errors, {}, episode)

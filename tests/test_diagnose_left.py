@@ -118,7 +118,7 @@ def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibrati
 
 
 def test_what_lasts_of_a_torque_is_that_of_sliding_friction(calibration):
-    """How friction turns over the calibration's noise states; what is off while it slides is seen in full."""
+    """How friction turns over is within the calibration's noise; errors while it slides count in full."""
     bench = Bench([log_of(next(drives(calibration, 54, {}, stops=3)))], calibration)
     [trial], means = bench.trials, bench.means("torque", LASTING["torque"])
     assert 0.01 < np.mean(~trial.slides) < 0.2
@@ -147,7 +147,8 @@ def test_an_uneven_disc_is_no_error_of_the_torque():
 
 
 def test_a_second_cause_is_no_shadow_of_the_largest():
-    """A shadow says nothing beside a smooth function of what it is a shadow of; what follows something else keeps its gain."""
+    """An effect that only imitates another explains nothing beside a smooth function of that one's signal; a second cause
+    keeps its gain."""
     rng, count, length = np.random.default_rng(4), 40, 60
     heat, speed = rng.uniform(0.0, 1.0, count * length), rng.uniform(-1.0, 1.0, count * length)
     shadow = (heat > 0.9).astype(float)
@@ -171,7 +172,8 @@ def test_a_second_cause_is_no_shadow_of_the_largest():
 
 
 def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):
-    """What the torque path leaves is current: a function of the current explains it whatever its cause."""
+    """The torque path's residual is computed from the current, so that a function of the current explains it whatever its
+    cause."""
     gains = {"current": 900.0, "motor_acceleration": 800.0, "motor_speed": 700.0}
     shadows = {name: (np.array([1000.0]), np.array([1000.0 - gain])) for name, gain in gains.items()}
     monkeypatch.setattr(Screening, "dependence", lambda self, model, channel, samples: shadows)
@@ -182,7 +184,7 @@ def test_a_residual_s_own_shadow_is_no_rival(monkeypatch):
 
 
 def test_a_signal_that_stands_explains_nothing():
-    """A disc that never turned has one angle: its cosine is an offset, which is something else's."""
+    """The angle of a disc that never turned is constant, and its cosine an offset, which has other causes."""
     force = np.linspace(0.0, 5000.0, 100)
     for name in ("disc_angle", "pad_temperature"):
         assert smooth_basis(name, np.full(100, 0.3), force).shape == (100, 0)

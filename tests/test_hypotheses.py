@@ -980,7 +980,7 @@ def test_a_contact_may_drift_as_fast_as_a_disc_grows_once_something_has_certainl
 @pytest.mark.parametrize(("factor", "share"), [(0.9, 0.2), (1.0, 0.0), (1.12, 0.2)])
 def test_a_first_stop_that_lasts_does_not_tell_a_torque_constant_from_pads(p, factor, seed, share):
     """Pads that are a tenth softer are likelier than a motor that is a tenth stronger, and what moves slowly shows nothing of
-    the rotor, which could tell. Before, nine tenths of such a training lay beyond three sigma."""
+    the rotor, which could tell. Otherwise nine tenths of such a training lie beyond three sigma."""
     true = p.copy()
     true["torque_constant"] *= factor
     begin, held = np.linspace(0.0, p["clearance"] + 12.0, 1500), p["clearance"] + 9.0

@@ -57,7 +57,7 @@ def _as_term(calibration, ripple):
     ],
 )
 def test_samples_that_no_motor_turns_to_leave_nothing_behind(begin, angle_rad, speed_rad_per_s, count):
-    """One that is wrong altogether had moved the zero by 2 rad, and the force by 3.6 kN without a word."""
+    """A zero that one wrong message moves by 2 rad is a force of 3.6 kN without a flag."""
 
     def change(samples):
         wrong = samples[begin : begin + count]
@@ -111,8 +111,8 @@ def test_a_speed_that_is_wrong_for_good_is_said_and_covered():
 
 @pytest.mark.parametrize("known_as", [_as_effect, _as_term])
 def test_teeth_stay_where_they_are_when_the_zero_moves(known_as):
-    """A mesh ripple of 6 % is known by its place on the shaft. With the angle as it is read it would be another one, and the
-    rest of the drive went from 27 to 334 N."""
+    """A mesh ripple of 6 % is known by its place on the shaft. Looked up at the angle as it is read it would be another one,
+    and leave 334 N instead of 27 in the rest of the drive."""
     calibration = shipped_calibration()
     ripple = {"cosine": 0.06, "sine": 0.0, "order_per_turn": 9.5}
     log = log_of(next(drives(calibration, 3, {"gear_mesh_ripple": ripple})))

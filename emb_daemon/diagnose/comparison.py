@@ -40,7 +40,7 @@ def by_log(bench: Bench, judged: EpisodeErrors, path: str) -> np.ndarray:
 
 
 def episodes_by_log(bench: Bench) -> np.ndarray:
-    """One for each episode that is a log's own, else zero, shape (logs, episodes)."""
+    """Mask (1 or 0), shape (logs, episodes): which episodes belong to which log."""
     lengths = [int(trial.episode[-1]) + 1 for trial in bench.trials]
     return (np.repeat(np.arange(len(lengths)), lengths) == np.arange(len(lengths))[:, None]).astype(float)
 

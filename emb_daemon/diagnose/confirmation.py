@@ -100,7 +100,8 @@ def _against(
     after: EpisodeErrors,
     held: Mapping[str, np.ndarray],
 ) -> tuple[str, str] | None:
-    """The suspect that left-out episodes speak against most, and what they say; ``held`` by channel, residuals before in N.
+    """The suspect against which left-out episodes speak most, with the reason in words; ``held``: residuals before by channel,
+    N.
 
     Validation logs, on which the whole estimator runs as well and which fitted nothing either, speak of its error together
     with them: in one log, where its contact angle wanders may hide what it gains."""
@@ -131,8 +132,8 @@ def _against(
 
 
 def _product(judged: EpisodeErrors, main: str, own: np.ndarray) -> float:
-    """A log's ``main`` error, its episodes being the ``own`` ones, times that of all logs, N²: what costs the one by a larger
-    factor than it gains all raises it. By mean squares a little gained where the error is large would pay for anything."""
+    """A log's ``main`` error (its episodes are the ``own`` ones) times that of all logs, N². The product rises where one log
+    loses by a larger factor than all gain. By mean squares a small gain on logs with a large error would outweigh any loss."""
     return judged.rmse(main, weights=own) * judged.rmse(main)
 
 
@@ -176,8 +177,8 @@ def _sizes(residual: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def _own_harm(selection: Selection, before: Mapping[str, np.ndarray]) -> tuple[str, str] | None:
-    """The suspect that does least on left-out episodes of a path that is no better for its suspects, all over or clearly so on
-    one log, and what is left of that path then; ``before`` by channel, residuals in N."""
+    """Of a path whose residual on left-out episodes has not fallen, or has clearly risen on one log: the suspect without which
+    least is left, with the reason in words; ``before``: residuals by channel, N."""
     after = _left_out_residuals(selection)
     for channel in sorted(selection.touched & set(FORCE_CHANNELS)):
         if worse := _where_worse(selection, channel, before[channel], after[channel]):
@@ -210,7 +211,7 @@ def _where_worse(selection: Selection, channel: str, before: np.ndarray, after: 
 def _fits_without(selection: Selection, without: str) -> Iterator[tuple[np.ndarray, dict[Coordinate, float]]]:
     """Each quarter of the episodes as a mask, shape (episodes,), with the parameters that the other quarters give."""
     bench = selection.model.bench
-    # Drawn, since a manoeuvre that is repeated would have one of its phases in a part of its own.
+    # Episodes are dealt at random: dealt in turn, a manoeuvre that repeats could have one of its phases in one part only.
     fold = np.random.default_rng(0).permutation(np.arange(bench.episodes) % _FOLDS)
     for number in range(_FOLDS):
         values = selection.applied(without)
@@ -300,11 +301,12 @@ def _gain(there: np.ndarray, bare: np.ndarray) -> float:
 
 
 def is_refuted(there: np.ndarray, bare: np.ndarray, episode: np.ndarray) -> bool:
-    """Whether a channel's residual with a suspect ``there``, and without it, speaks as clearly against it as what was fitted
-    had to speak for it: by the likelihood of all that it does against none, episodes (N,) counted from 0 being independent.
+    """Whether validation logs refute a suspect as clearly as the fitted logs had to prove it: by the likelihood ratio of its
+    full contribution against none, with independent episodes. ``there`` and ``bare``: the channel's residual with and without
+    it, shape (N,); ``episode`` (N,) counts from 0.
 
-    Where it does next to nothing a log is a little better or worse for it by chance, and refutes nothing. What makes its path
-    clearly worse goes in any case."""
+    Where it contributes next to nothing a log is a little better or worse for it by chance, and refutes nothing. A suspect
+    that makes its path worse by more than `HARM` is refuted in any case."""
     if _gain(there, bare) >= 0.0 or rmse(there) > HARM * rmse(bare):
         return _gain(there, bare) < 0.0
     moments = Moments.of((bare - there)[:, None], bare, episode, int(episode[-1]) + 1)

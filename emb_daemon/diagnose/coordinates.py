@@ -128,7 +128,8 @@ _CLEARANCE_RAD = 0.5
 HISTORY_TIME = "thermal.softening.history_time_s"
 #: Pads soften with heat, never stiffen: what was calibrated holds within a third or this, and never beyond the most, 1/K.
 _SOFTENING, _MOST_SOFTENING = 1e-4, 2e-3
-#: Phase runs away with the angle: an order is only ever touched up. Step and standard deviation, per turn.
+#: Step and standard deviation of a harmonic's order, per turn. Both are small, because over many turns a small change of the
+#: order turns the phase by much.
 _ORDER_STEP, _ORDER = 1e-4, 0.1
 #: Standard deviation of an effect's shape, at least; over its size where that is larger.
 _SHAPE = 0.5
@@ -153,13 +154,13 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
             result.append(scaled_coordinate(calibration, keys, "stiffness", _CURVE))
     for name in ("per_K", "history_per_K"):
         known = parameter(calibration, f"thermal.softening.{name}")
-        # Of what no log has shown yet only the usual size is known.
+        # A softening of zero was never identified: its prior is the usual size.
         prior = max(abs(known.value) / 3.0, _SOFTENING) if known.value else _usual(known.step)
         move = (Move(known.key, 1.0, 0.0, _MOST_SOFTENING),)
         low, high = min(0.0, known.value), max(_MOST_SOFTENING, known.value)
         result.append(Coordinate(known.key, "stiffness", known.value, known.step, prior, move, low, high, known.unit))
     if not calibration.thermal.softening.history_per_K:
-        # No log has shown it yet.
+        # No log has shown the history's time constant yet.
         result.append(scaled_coordinate(calibration, [HISTORY_TIME], "stiffness", 1.0))
     for key, channel, prior in _BASE:
         coordinate = scaled_coordinate(calibration, [key], channel, _STATED if stated and key == TORQUE_CONSTANT else prior)

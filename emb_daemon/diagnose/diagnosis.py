@@ -180,7 +180,7 @@ def diagnose(
             told = ([log.with_reference_earlier(late_s) for log in logs] for logs in (fit_logs, validate))
             bench, judges = (Bench(logs, calibration) if logs else None for logs in told)
         result = diagnose_bench(bench, judges, progress)
-        # What is found no longer hides it.
+        # What was found may have hidden that the reference is later still.
         later_s = _later_s(result) if again else 0.0
         if not later_s:
             break
@@ -342,9 +342,9 @@ def _tradeoffs(model: Model, effect: Effect, own: Sequence[Coordinate]) -> str:
 
 
 def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
-    """Base parameters that moved, as applied. What only goes together (the curve's coefficients) has its gain together:
-    what left-out episodes lose without it, everything else free. The estimator itself runs without it, since a line drawn
-    from where a far fit ended does not lead back."""
+    """Base parameters that moved, as applied. Parameters that move together (the curve's coefficients) have one gain: what
+    left-out episodes lose without them, everything else free. That is found by running the estimator without them, because
+    regressors at the end of a long fit do not predict the residual at its beginning."""
     model, calibration = selection.model, selection.model.bench.calibration
     base = [c for c in selection.applied() if not c.effect]
     groups: dict[str, list[Coordinate]] = {}
@@ -353,7 +353,7 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
     result = {}
     for group in groups.values():
         channel, gain = group[0].channel, 0.0
-        # What stands as chosen was fitted elsewhere.
+        # Coordinates that stand as chosen were fitted elsewhere, so that no gain is computed here.
         if not model.chosen.issuperset(group):
             rest = [c for c in model.movable(channel) if c not in group]
             without = model.bench.residual_held({**model.values, **{c: c.start for c in group}}, channel, model.heat)
@@ -430,7 +430,7 @@ def _by_log(
     selection: Selection, channel: str, bench: Bench, before: np.ndarray, after: np.ndarray
 ) -> list[tuple[float, float, float, str]]:
     """What lasts of a channel before and after, RMS, what the calibration achieved, and the log: of each with episodes enough
-    to tell it from chance. It would drown in that of logs that are right."""
+    to tell it from chance. An error of one log would be averaged away by logs without it."""
     if not bench.has_reference or bench.own_data:
         return []
     samples, force, result = LASTING[channel], _force_of(bench), []
@@ -450,10 +450,11 @@ def _force_of(bench: Bench) -> np.ndarray:
 
 
 def _withdrawn(selection: Selection, chosen: Selection, channel: str) -> list[Dependence]:
-    """What lasts of a channel's residual and effects or terms explained that confirmation took out again, by their signals, if
-    that matters and nothing else explains it now.
+    """Dependences of a channel's lasting residual on the signals of effects or terms that confirmation took out again, where
+    they matter and nothing else explains them now.
 
-    What these logs prove, and is not true of others, or harms the estimator, is no such effect; but something is there."""
+    Something is there: these logs prove it. But what does not hold on other logs, or harms the estimator, is not that
+    effect."""
     gone = [chosen.candidates[name] for name in chosen.accepted if name not in selection.accepted]
     signals = list(dict.fromkeys(c.effect.signal for c in gone if c.channel == channel))
     if not signals:
@@ -477,8 +478,8 @@ def _heat_dependences(selection: Selection, augmented: Calibration) -> list[Depe
 
 
 def undecided(selection: Selection) -> dict[str, float]:
-    """Share of the clamp force by which rivals of the accepted terms do otherwise, by key of the noise that is to hold it;
-    none of a motor that turns free, whose force is nothing."""
+    """RMS difference between accepted terms and those that are as likely, as a share of the clamp force, by the key of the
+    noise that has to cover it; empty for a motor that turns free, whose force is zero."""
     size, result = selection.screening.force_N, {}
     if size <= 0.0:
         return result
@@ -490,8 +491,8 @@ def undecided(selection: Selection) -> dict[str, float]:
 
 
 def _with_noise(calibration: Calibration, selection: Selection) -> Calibration:
-    """The calibration with the noise of its paths as it now is: less of the stiffness path where that was explained, and what
-    rivals of accepted terms do otherwise."""
+    """The calibration with new noise of its paths: less of the stiffness path where its residual was explained, and more by
+    what terms as likely as the accepted ones would change (`undecided`)."""
     calibration = _with_less_noise(calibration, selection)
     more = undecided(selection)
     return moved(calibration, {key: float(np.hypot(value_of(calibration, key), share)) for key, share in more.items()})
@@ -500,7 +501,8 @@ def _with_noise(calibration: Calibration, selection: Selection) -> Calibration:
 def _with_less_noise(calibration: Calibration, selection: Selection) -> Calibration:
     """The calibration with the stiffness path's noise as it now is, if what it states contains what has been explained.
 
-    The filter would go on trusting the worse path. It is only ever lowered: a rest that nothing explains is no noise."""
+    Otherwise the filter would trust the stiffness path too little. The noise is never raised: an unexplained residual is no
+    noise."""
     noise, model = calibration.noise, selection.model
     if "stiffness" not in selection.touched:
         return calibration

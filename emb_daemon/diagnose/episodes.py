@@ -80,8 +80,9 @@ def standing(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 
 
 def yielding(angle_rad: np.ndarray, force_N: np.ndarray, friction: np.ndarray, least_N: np.ndarray) -> np.ndarray:
-    """Mask of the samples, shape (N,), in which the load has turned the friction of the gear back by ``least_N`` or more since
-    the motor last slid on: by less motion than a resolver tells, as an uneven disc does at each turn.
+    """Mask of the samples, shape (N,), in which the load may have turned the friction of the gear back without a motion that
+    the resolver shows: the load has moved against the friction by ``least_N`` or more since the motor last slid, as an uneven
+    disc makes it at each turn.
 
     ``friction``: its state as the angle tells it, -1 to 1; while it opposes closing, a load that grows is what turns it."""
     against = uniform_filter1d(force_N, _NOISE_SAMPLES) * np.where(friction < 0.0, -1.0, 1.0)
@@ -97,7 +98,7 @@ def yielding(angle_rad: np.ndarray, force_N: np.ndarray, friction: np.ndarray, l
 
 
 def _slides_on(angle_rad: np.ndarray) -> np.ndarray:
-    """Samples at which the motor has turned on so far since the one before of these that friction has turned over again."""
+    """Samples at which the motor has turned, since the previous one of them, far enough to turn friction over again."""
     found, last = [], angle_rad[0] if len(angle_rad) else 0.0
     for index, angle in enumerate(angle_rad.tolist()):
         if abs(angle - last) >= _HOLDING_RAD:

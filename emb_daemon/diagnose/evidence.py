@@ -88,7 +88,7 @@ def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
     products = moments.products
     columns = products.shape[1] - 1
     total = products.sum(axis=0)
-    # Of a column that is nothing throughout a prior alone speaks.
+    # Of a column of zeros only the prior is known.
     size = np.diag(total)[:columns]
     scale = np.sqrt(np.where(size > 0.0, size, 1.0))
     ridge = np.diag(penalty / scale**2 + 1e-10)
@@ -115,8 +115,8 @@ def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
 
 
 def solve_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Penalised least squares within bounds, shape (columns,), as those of a fit: what one value must not take the others do
-    otherwise."""
+    """Penalised least squares with values kept within bounds, shape (columns,), as in a fit; the free values make up for one
+    that stands at its bound."""
     from scipy.optimize import lsq_linear
 
     total = moments.products.sum(axis=0)
@@ -126,7 +126,7 @@ def solve_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: n
 
 
 def leave_out_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """`LeftOut.left_out` with what a bound holds standing there, shape (episodes,)."""
+    """`LeftOut.left_out` with values kept within bounds, shape (episodes,)."""
     values = solve_within(moments, penalty, low, high)
     free = (low < values) & (values < high)
     turn = np.eye(len(values) + 1)

@@ -59,8 +59,8 @@ _GATES: dict[str, tuple[str, ...]] = {
     "torque": ("always", "load", "closing", "opening"),
     "gear_friction": ("always", "load", "closing", "opening"),
 }
-#: Ports at which two signals may multiply: factors and lengths. What counts from the power on multiplies nothing, and places
-#: along the screw are asked by bumps.
+#: Ports at which two signals may multiply: factors and lengths. Signals in `_ALONE` are not multiplied: those that count from
+#: power-on have no physical zero, and dependence on the place along the screw is covered by bumps.
 _MULTIPLIED = (
     "thickness", "stiffness", "torque_constant", "relaxation_time", "gear_gain", "gear_friction", "heat_share",
     "contact_conductance", "disc_cooling",
@@ -206,7 +206,7 @@ def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[
                 form = Form(port, signal, memory, shape, "always", scale, middle, exponent, time, low, high, other, most)
                 straight = shape != "onset" and exponent == 1.0
                 found += [form] if memory == "response" or not straight else []
-                # Of the plain product once is enough.
+                # The product of two signals, neither shaped, is the same in both orders: once is enough.
                 found += [replace(form, straight=True)] if straight and signal < other else []
     return found
 
@@ -240,8 +240,9 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
                 yield "none", "bump", share * width, float(place), 1.0, 1.0
         return
     if port == "torque_constant" and signal == "current":
-        # As it is: through a lag it would not saturate when the motor accelerates, and a gear gain over the force would seem
-        # as good. The residual of the torque path is current itself, but the constant's own column takes that shadow.
+        # The current itself, not lagged: saturation shows while the motor accelerates, and lagged the term would look like a
+        # gear gain over the force. That the torque path's residual is a current itself does no harm, because the column of the
+        # constant takes up what both share.
         for exponent in _EXPONENTS:
             yield "none", "even_power", reach, 0.0, exponent, 1.0
         yield from _responses(reach)
@@ -251,7 +252,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     centre = _COLD_C if signal in _TEMPERATURES else 0.0
     farthest = max(abs(low - centre), abs(high - centre))
     if HOOKS[port].channel == "temperature":
-        # Temperatures remember by themselves.
+        # Temperatures are lagged already: no further memory.
         yield from (("none", "odd_power", farthest, centre, exponent, 1.0) for exponent in _EXPONENTS)
         yield from (("none", "decay", share * reach, 0.0, 1.0, 1.0) for share in _SCALES)
         yield from (("none", "onset", width, low + place * width, 1.0, 1.0) for place in _PLACES)
@@ -261,7 +262,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
             yield "deficit", "odd_power", reach, 0.0, 1.0, time
         return
     if signal == "clamp_force" and port in ("thickness", "stiffness"):
-        # A curve is the calibration's own; what depends on the way there is not.
+        # A function of the force alone is the calibration's curve; what is looked for is how the force was reached.
         for share in _SLIPS:
             yield "slip", "odd_power", 1.0, 0.0, 1.0, share * width
         for time in _CREEP_S:
@@ -283,7 +284,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         for time in _TIMES_S:
             yield "lag", "odd_power", farthest, centre, 1.0, time
     if signal in ("disc_speed", "brake_torque", "friction_power", "clamp_force"):
-        # Of the power one a response is the lag of above.
+        # A response to the first power of a signal is the lag above.
         yield from _responses(reach, (2.0,))
         for time in _TIMES_S:
             for place in _PLACES:

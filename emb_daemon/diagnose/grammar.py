@@ -1,4 +1,4 @@
-"""The last rung: when the catalogue is exhausted and something is left, make the term.
+"""Terms for what the catalogue does not explain: the last step of a search.
 
 Every form of the grammar (`forms`) is screened on episodes left out of its fit, beside all that the path's own parameters
 can do. The best few are run through the estimator and fitted; the one whose gain is worth its length (minimum description
@@ -104,7 +104,8 @@ def _restated(found: Selection, before: Selection, channel: str) -> Selection:
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
-        # Not refitted without it: everything else would make up for it, and its heat too, and no single fit leads back.
+        # Everything else stays as fitted with the term: refitted without it, it would make up for the term, and a single fit
+        # of the new shape does not undo that.
         refused = replace(candidate, accepted=False, reason="its shape was chosen again")
         bare = replace(before.noted([refused]), model=before.model.without(before.model.of_effect(name)))
         found = min([*_in_shapes(bare, candidate, channel), found], key=lambda s: _description(s, channel))
@@ -120,7 +121,7 @@ def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int |
     search, result = _search(start.model, channel), []
     prospects = sorted(search.of_means(candidate.effect.hook, candidate.signals), key=lambda p: p.evidence.gain)
     nearly = [p for p in prospects if p.evidence.gain >= NEARLY * prospects[-1].evidence.gain]
-    # Of one structure that which gains most: fits lead from one size to another.
+    # Of forms with the same structure the one that gains most: a fit finds the size.
     structures = {replace(p.form, **dict.fromkeys(p.form.fitted, 0.0)): p for p in nearly}
     for prospect in sorted(structures.values(), key=lambda p: -p.evidence.gain)[:most]:
         effect = made_effect(prospect.form, _name(prospect.form, start))
@@ -205,11 +206,11 @@ def _with_hidden(found: Selection, catalogue: Selection, channel: str) -> Select
 
 
 def _called_by_name(selection: Selection, channel: str) -> Selection:
-    """The same with an effect of the catalogue in the place of each term that it describes as shortly: what has a name is
-    called by it.
+    """The same, with each term replaced by an effect of the catalogue that describes the residual as shortly: an effect has a
+    name.
 
-    That something is there the term has proven, over more forms than the catalogue has; few effective episodes, which leave
-    the catalogue's own test no freedom, are no reason against the name."""
+    The term has proven that something is there, against more forms than the catalogue has. So the effect need not pass the
+    catalogue's own test, which may lack degrees of freedom where few episodes count."""
     for term in _made(selection, channel):
         bare = selection.without(term, "an effect of the catalogue says the same")
         proven = selection.candidates[term]
@@ -249,7 +250,7 @@ def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:
 
 
 def _wanted(selection: Selection, channel: str) -> bool:
-    """Whether enough is left, of what lasts longer than noise, for a term to be made up."""
+    """Whether the lasting residual is large enough for a term to be looked for."""
     model, floor = selection.model, selection.screening.floor(selection.model, channel, made=True)
     if channel == CHANNEL_OF_HEAT:
         left = float(np.square(Screen(model, channel, 1).residual).sum()) - noise_left(model, channel, 1)
@@ -261,9 +262,9 @@ def _wanted(selection: Selection, channel: str) -> bool:
 def _one_more(selection: Selection, channel: str) -> Selection:
     """With the best term for one channel, accepted if it is proven, else with what speaks against it.
 
-    The screen goes by lines drawn from where nothing has been fitted yet. What another place could do of a small step it
-    cannot do of a large effect, and heat does not answer in proportion at all. So what is as good on the screen is fitted
-    with everything else, and what then describes the rest most shortly is taken."""
+    The screen is linear about the present fit. Another place that could do the same as a small term may not do the same as a
+    large one, and heat is not linear at all. So forms that are as good on the screen are fitted with everything else, and the
+    one that then describes the residual most shortly is taken."""
     model, screening = selection.model, selection.screening
     search = _search(model, channel)
     floor = screening.floor(model, channel, made=True)
@@ -285,14 +286,14 @@ def _one_more(selection: Selection, channel: str) -> Selection:
             fitted.append((prospect, found))
             continue
         refused = refused.noted([candidate])
-        # Where these logs cannot tell forms apart, one that is more than its port may bear, or that no fit leads to, is not
-        # the one.
+        # Where these logs cannot tell forms apart, one that exceeds its port's limit, or whose gain the fit does not reach, is
+        # dropped.
         if straight and not fitted and candidate.reason not in (TOO_LARGE, _NOT_HELD):
             break
     if not fitted:
         return refused
     if straight:
-        # By what the bootstraps go by as well: they must not be asked for the port of what they never choose.
+        # Chosen by left-out episodes, as the bootstraps choose: they could never support another's port.
         first = int(np.argmin(_lengths_fitted(selection, channel, fitted, np.ones((1, model.bench.episodes)))))
     else:
         first = int(np.argmin([one.model.noise(channel) for _, one in fitted]))
@@ -309,17 +310,17 @@ def _one_more(selection: Selection, channel: str) -> Selection:
 
 
 def _is_longer(found: Selection, selection: Selection, channel: str) -> bool:
-    """Whether a brake's logs are described more shortly without what was ``found``: the best of all forms follows a little of
-    whatever is left, surely so where a small cause is left that none of them is.
+    """Whether a brake's logs are described more shortly without what was ``found``. The best of all forms always follows a
+    little of what is left, most of all where the cause is small and has none of the forms.
 
-    Not asked of what clamps nothing: five of 36 recordings of such machines lost by it what holds on other logs."""
+    Not asked of machines that clamp nothing: by this rule five of 36 recordings lost a term that holds on other logs."""
     clamps = selection.model.bench.clamps
     return clamps and _description(found, channel) > _description(selection, channel)
 
 
 def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
-    """Those that gain as much as the first, beginning with what most resampled episodes choose: which of them gains a little
-    more is chance. Then what gains less, but is chosen by enough of these."""
+    """Prospects that gain as much as the first (`AS_GOOD`), ordered by how many bootstraps choose them, because small
+    differences in gain are chance; then those that gain less but are chosen by enough bootstraps (`_RIVAL`)."""
     least = AS_GOOD * prospects[0].evidence.gain
     equal = sorted((p for p in prospects if p.evidence.gain >= least), key=lambda p: -shares[p.means])
     return [*equal, *(p for p in prospects if p.evidence.gain < least and shares[p.means] >= _RIVAL)]

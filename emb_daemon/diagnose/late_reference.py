@@ -1,4 +1,4 @@
-"""Is the reference force of the time of the motion? A load cell's filter makes it late.
+"""Lateness of the reference force beside the motion, as a load cell's filter makes it.
 
 Beside the angle alone a force that is late and an angle that is early are the same, and a relaxation makes up for most of
 either. The current tells them apart: it bears the force of its own time, whatever the angle says.
@@ -19,7 +19,8 @@ from emb_daemon.wire.contract import CYCLE_S
 _SURELY, _WITHIN = 5.0, 0.6
 #: Samples in the means that are compared, of which those in which friction turns over are no part.
 _SLIDING = 2
-#: A line leads to five sixths of twelve milliseconds. It is followed so often at most, until this share of a cycle is left.
+#: Number of linear steps at most, and share of a cycle from which no further one is made: a single step finds five sixths of
+#: twelve milliseconds.
 _TURNS, _LITTLE = 5, 0.1
 
 
@@ -40,7 +41,7 @@ def reference_late_s(bench: Bench) -> float:
 
 
 def may_be_late(bench: Bench) -> bool:
-    """Whether the current says nothing else of the reference force's time than the angle does."""
+    """Whether the current does not contradict the time of the reference force that the angle shows."""
     return _is_told(bench) and _compare(bench)[2]
 
 
@@ -49,8 +50,8 @@ def _is_told(bench: Bench) -> bool:
 
 
 def _compare(bench: Bench) -> tuple[float, float, bool]:
-    """Time (s) by which the force is late beside the angle, by the line drawn where the force is, its standard deviation, and
-    whether the current says the same."""
+    """Time (s) by which the force is late beside the angle, by one linear step, its standard deviation (s), and whether the
+    current says the same."""
     model = Model.of(bench).refined({"stiffness", "torque"})
     rate = np.concatenate([np.gradient(np.nan_to_num(trial.force_N), trial.log.time_s) for trial in bench.trials])
     speed = np.concatenate([trial.log.samples["speed"] for trial in bench.trials])

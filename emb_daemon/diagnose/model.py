@@ -85,8 +85,8 @@ class Model:
         return [c for c in self.values if c.channel == channel and c not in self.chosen]
 
     def movable(self, channel: str) -> list[Coordinate]:
-        """What no bound holds of that: what the others do a line must not put down to one that cannot go on, as a drag that
-        drives or an offset of the load, which is a friction below zero where a motor turns one way."""
+        """Of these the coordinates that do not stand at a bound. A linear test would otherwise let a parameter move beyond its
+        bound and explain what others do: a friction below zero where a motor turns one way, for example."""
         return [c for c in self.own(channel) if not c.is_held(self.values[c])]
 
     def of_effect(self, name: str) -> list[Coordinate]:
@@ -106,7 +106,8 @@ class Model:
         )
 
     def says_nothing(self, amplitudes: Iterable[Coordinate]) -> bool:
-        """Whether a fit has left amplitudes at nothing, which a line may take for a gain: it knows no bound."""
+        """Whether a fit has left amplitudes at zero, held by their bounds. A linear test does not know bounds, and may see a
+        gain there."""
         return all(abs(self.values[c]) < c.step for c in amplitudes)
 
     def without(self, gone: Iterable[Coordinate]) -> "Model":
@@ -168,7 +169,7 @@ class Model:
 
     def _fitted(self, channel: str) -> "Model":
         own, episode = tuple(self.own(channel)), self.bench.episode[channel]
-        # In units of what an episode knows, as priors are.
+        # In units in which an independent observation has variance one, as priors have.
         scale = float(np.sqrt(self.inflation(channel) * max(self.noise(channel), 1e-12)))
         start = tuple(self.values[c] for c in own)
         bench, values, heat = self.stood.get(channel, (None, None, None))

@@ -1,4 +1,4 @@
-"""Over which orders per motor turn does a residual vary most?"""
+"""Orders per motor turn over which a residual varies most."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def strongest_orders(
     the peak."""
     samples = np.concatenate([trial.log.samples for trial in model.bench.trials])
     travel = np.abs(samples["speed"]) * samples["dt"]
-    # A ripple is where the motor is, and not where a late angle has it.
+    # Ripples follow the motor's true angle: a known delay is taken out.
     late = known_delay(to_parameters(model.bench.calibrated(model.values))["effects"])
     angle = samples["angle"] + late * samples["speed"]
     harmonic, limits = effect.harmonic, effect.parameter(effect.harmonic.order).starts

@@ -257,14 +257,14 @@ class Search:
         for number in range(CHANCES):
             shift = int(len(values) * self.random.uniform(0.1, 0.9))
             if any(float(screen.scores_of(does * np.roll(own, shift, axis=0)).gain.max()) >= gain for does, own in by_port):
-                # One that is as good is one too many, and settles it.
+                # One maximum that is as good already exceeds the level: no need to go on.
                 return 2.0 / (2.0 + number)
         return 1.0 / (1.0 + CHANCES)
 
     def at_another_time(self, form: Form) -> float:
         """Gain of a term with its signal moved in time, as if the log were a circle, the median of a few; none for a ripple.
 
-        Not by the largest: what rises once and stays is, moved by a little, still much of itself."""
+        The median, not the largest: a signal that rises once and stays is nearly the same when moved by a little."""
         return 0.0 if form.shape == "harmonic" else float(np.median(self.gains_moved(form)))
 
     def gains_moved(self, form: Form) -> np.ndarray:
@@ -449,7 +449,7 @@ def _order(search: Search, port: str, order: float) -> float:
         u = columns.T @ screen.residual[:, 0]
         return float(u @ np.linalg.pinv(columns.T @ columns, hermitian=True) @ u)
 
-    # Of all places together a lobe is as wide as this.
+    # Width of a spectrum's lobe over the whole range of angles.
     lobe = 2.0 * np.pi / max(high - low, 1.0)
     tried = (order + lobe * np.linspace(-0.5, 0.5, 2 * _TRIES + 1)).tolist()
     return max((o for o in tried if o > 0.0), key=gain)

@@ -61,7 +61,8 @@ _BY_CURRENT = [
 #: Step of the current by which the torque of one ampere more is found, A.
 _MORE_A = 0.1
 #: Samples from which a search begins where signals alone say: a speed that is the mean of its cycle, or a frame that waits for
-#: the next, is off by up to one, and so near the catalogue's own test leads there. Standard deviations that are certain.
+#: the next, is off by up to one, and from so near the fit of the catalogue's effect arrives by itself. Standard deviations
+#: that are certain.
 _FAR, _SURELY = 2.0, 5.0
 #: Current and motion are compared over so many ms, more than the longest age that a calibration may state. Share of a cycle
 #: by which they may be apart, as the estimate allows for (`models.alignment`): a whole one made 550 N of viscous friction
@@ -163,8 +164,9 @@ def _temperatures(log: Log) -> tuple[np.ndarray, np.ndarray]:
 def _partial_correlation(trials: Sequence[Trial]) -> float:
     """Squared partial correlation of current and reference load, beside the motor's direction, speed and acceleration.
 
-    What the load changes by at once, and the current does not, cannot be the current's work, and is left out: where a jerking
-    motor loads one that is held by its current, a constant fitted to the current would be too large by that share."""
+    Sudden changes of the load that the current does not share are left out, because the current cannot have made them: where
+    another, jerking motor loads one that its current holds, a constant fitted to the current would be too large by that
+    share."""
     tables, changes = [], []
     for trial in trials:
         samples = trial.log.samples
@@ -266,10 +268,11 @@ class Bench:
         self.calibration = calibration
         self.own_data = own_data
         self.straight: bool = True
-        # A thread that waits for one other costs more than what most of these tasks do.
+        # Waiting for another thread costs more than most of these tasks.
         self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(workers).map if workers > 1 else map
         mounted = mounted or [{}] * len(logs)
-        #: By key of the calibration, what signals alone tell of effects, where that is far from what it says.
+        #: By key of the calibration: amplitudes of effects that follow from the signals alone, where far from the
+        #: calibration's.
         self.told: dict[str, float] = _told_by_signals(logs, calibration)
 
         self.trials: list[Trial] = list(self.map(self._trial, range(len(logs)), logs, mounted))
@@ -282,7 +285,8 @@ class Bench:
         self.has_current: bool = any(trial.log.samples["has_current"].any() for trial in self.trials)
         late = [_current_late_s(trial) for trial in self.trials] if self.clamps and self.has_reference else [0.0]
         #: Time by which the current comes after the motion that it causes, s; negative if the motion comes after it, and after
-        #: the force. Nothing that is looked for explains a path of two times: what is found there is a shadow of that.
+        #: the force. A path whose signals are of two times is not searched: whatever is found there imitates the difference in
+        #: time.
         self.current_late_s: float = max(late, key=abs)
         #: Current below which its sensor tells nothing, A: friction that seems to need none there is no cause.
         self.current_dead_A: float = _dead_band_A(logs)
@@ -335,9 +339,9 @@ class Bench:
     def means(self, channel: str, samples: int) -> Averaging:
         """Means over so many samples of a channel; of a brake's torque without those in which friction turns over.
 
-        How it does is a guess of every model, and with the motor held just behind a reversal it lasts as long as the hold: on
-        two simulated brakes with nothing hidden it alone explained 23 and 24 N of what lasts, where 8 and 11 N are left
-        without these samples. Of what clamps nothing the presliding angle is a guess itself."""
+        How friction turns over is modelled roughly, and with the motor held just behind a reversal the error lasts as long as
+        the hold: on two simulated brakes with nothing hidden it alone explained 23 and 24 N of what lasts, where 8 and 11 N
+        are left without these samples. Of what clamps nothing the presliding angle is a guess itself."""
         told = np.concatenate([trial.slides for trial in self.trials]) if self.shows_turning(channel) else None
         return Averaging(self.episode[channel], samples, told)
 
@@ -488,13 +492,13 @@ class Bench:
         else:
             # Per ampere that is really there, so that the noise of the current is no regressor of its own constant.
             load = left / (trace["torque_constant"] if per_ampere is None else per_ampere) * self.newton_per_ampere
-        # The current is a mean over the cycle before its sample: of a longer way it tells the end.
+        # The current is a mean over the cycle before its sample: over a longer gap it belongs to the end alone.
         told = trial.log.samples["dt"] <= ONE_CYCLE_S
         if self.current_dead_A:
             least_A = self.current_dead_A + _CLEAR * self.calibration.noise.current_A
             told &= np.abs(trial.log.samples["current_q"]) > least_A
         if self.clamps:
-            # What friction carries there no angle tells.
+            # There the load may have turned friction back by less than the angle shows.
             told &= ~trial.yields
         if self.turns_free:
             # Without a load friction holds a motor that stands, whatever its current below that of friction.

@@ -39,8 +39,8 @@ Q_VALUE = 0.01
 #: all forms gains 0.07 to 0.12 of what lasts (four drives), and the best effect of the catalogue that chance does not explain
 #: 0.11 (twelve).
 _RESIDUAL_SHARE, _LASTING_SHARE, _SIGNAL_SHARE = 0.06, 0.2, 0.002
-#: Samples in the shortest means, which leave out where friction turns over. How it does is a guess of every model: where it
-#: turns over late it looks like a friction that rises with speed.
+#: Samples in the shortest means, which leave out where friction turns over. How friction turns over is modelled roughly; where
+#: it turns over late it looks like a friction that rises with speed.
 _SLIDING = 2
 #: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
 _FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
@@ -133,8 +133,8 @@ class Screening:
     def floor(self, model: Model, channel: str, made: bool = False) -> float:
         """Least RMS of an effect that matters, or of the heat balance of a term that is ``made``, in the channel's unit.
 
-        A term is held against all that heat capacities and conductances can do in these logs, which may take four fifths of it
-        and will not in the next."""
+        A term of the heat balance has a lower limit, because its gain is only what heat capacities and conductances cannot
+        make up for in these logs, which may be a fifth of what it does in the next."""
         if channel == "temperature" and not made:
             return _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
@@ -189,7 +189,7 @@ class Screening:
         channel = next(iter(own.values())).channel
         low, high = np.quantile(self.signals[effect.signal], (0.05, 0.95))
         if low == high:
-            # Where its signal stays the same nothing tells an effect from a constant.
+            # Where its signal is constant an effect cannot be told from an offset.
             return Candidate(effect, channel)
         parts = _parts(effect, [own[p.name] for p in effect.amplitudes])
         best = Candidate(effect, channel, tuple(parts[-1]))

@@ -68,8 +68,8 @@ def _finished(selection: Selection) -> Selection:
 
 
 def _told(begin: Model) -> dict[Coordinate, float]:
-    """Coordinates of what signals alone tell, where they say it is: what is refitted without it would make up for it, a
-    relaxation for a late angle."""
+    """Coordinates of effects that the signals alone show (`Effect.measure`), at the values shown. Refitted without them other
+    parameters would make up for them, a relaxation for a late angle."""
     bench, known = begin.bench, {}
     for effect in REGISTRY:
         if effect.measure is None or not (channel := bench.channel_of(effect.channel)):

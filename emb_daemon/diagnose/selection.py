@@ -174,7 +174,7 @@ def recalibrate_heat(selection: Selection) -> Selection:
 def find_recalibrated(selection: Selection, start: Model, channels: Iterable[str]) -> dict[str, float]:
     """Those of some channels in which refitting the base parameters gains on left-out episodes what matters."""
     model, floor = selection.model, selection.screening.floor
-    # Without a reference nobody knows which path is off: that is for adaptation to settle, not for a diagnosis.
+    # Without a reference it is unknown which path is off: adaptation decides that, not a diagnosis.
     asked = [c for c in channels if model.own(c) and c != "innovation"]
     gains = {c: recalibration_gain(model, start, c) for c in asked}
     return {c: gain for c, gain in gains.items() if gain > 0.0 and gain >= floor(model, c)}
@@ -182,7 +182,7 @@ def find_recalibrated(selection: Selection, start: Model, channels: Iterable[str
 
 def recalibration_gain(model: Model, start: Model, channel: str) -> float:
     """RMS that refitting a channel's base parameters takes on left-out episodes from what it leaves at the ``start``."""
-    # About where the fit ended: the line that touches the start does not lead there where friction turns over at once.
+    # Linear about the end of the fit: regressors at its start do not predict the end where friction turns over abruptly.
     restored = model.residual_at(channel, {c: model.centre.get(c, c.start) for c in model.movable(channel)})
     left_out = model.left_out(channel, residual=restored)
     before = float(start.residual[channel] @ start.residual[channel])
@@ -272,8 +272,8 @@ def _settle(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Cand
 def _try_unsure(selection: Selection, tested: list[Candidate], rivals: dict) -> Selection:
     """With a candidate that would explain much, is not sure in the linear test, but is once it has been fitted.
 
-    Far from the solution the rest of a strong effect, whose shape was only guessed, is what makes it unsure. The fitted
-    effect must then pass for itself and all others that might have been tried (Bonferroni)."""
+    Where the shape of a strong effect is only guessed, what the guess leaves makes the effect unsure. Once fitted it must pass
+    with a correction for all candidates that could have been tried in this way (Bonferroni)."""
     model = selection.model
     large = [
         c
@@ -342,7 +342,8 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
         gain, chance = model.rms(evidence.gain, candidate.channel), evidence.p_value
         unclear = over_grammar and _is_unclear(evidence)
         if whole and (0.0 < gain < floor if over_grammar else min(gain, Q_VALUE - chance) <= 0.0):
-            # From where a far fit ended a line does not lead back: what it gains, a fit without it says.
+            # Regressors at the end of a long fit do not predict the residual without the effect: its gain is found by a fit
+            # without it.
             unclear, without = False, model.without(model.of_effect(name)).refined({candidate.channel})
             fall = np.subtract(*(m.left_out(candidate.channel, samples=samples) for m in (without, model)))
             gain, chance = (
@@ -350,8 +351,9 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
                 float(ttest_1samp(fall, 0.0, alternative="greater").pvalue),
             )
         little = gain < floor
-        # What was proven over the whole grammar may be carried by few episodes, but what these gain must matter, and they must
-        # agree; and so must what is gained where a prior alone says how large it is.
+        # A term that is above chance over the whole grammar may rest on few episodes, but its gain must matter and its
+        # amplitude be clear of zero. An effect that gains too little to matter stays only if it is clear of zero with its
+        # prior's share included.
         by_chance = unclear if over_grammar else chance > Q_VALUE
         if (
             gain <= 0.0
@@ -365,14 +367,14 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
 
 
 def _is_unclear(evidence: Evidence) -> bool:
-    """Whether amplitudes are not clear of nothing by how episodes scatter: a term that one hot episode carries may be the best
-    of the whole grammar, and be as good as nothing in the others."""
+    """Whether amplitudes are within `_CARRIED` standard deviations (jackknife over episodes) of zero: a term that rests on one
+    hot episode may be the best of the whole grammar, and zero in all others."""
     return bool(np.square(evidence.values / evidence.sigmas).sum() < _CARRIED**2 * len(evidence.values))
 
 
 def _is_carried(model: Model, group: Sequence[Coordinate]) -> bool:
-    """Whether amplitudes are clear of nothing by their standard deviations, their priors' share of which evidence over
-    episodes does not hold."""
+    """Whether amplitudes are beyond `_CARRIED` standard deviations from zero, by the fit's covariance: the jackknife over
+    episodes lacks the priors' share of it."""
     values = np.array([model.values[c] for c in group])
     covariance = model.fits[group[0].channel].block(group)
     known = bool(np.isfinite(covariance).all())

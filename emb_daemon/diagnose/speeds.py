@@ -23,7 +23,8 @@ _LAGS, _OF_NOISE, _ALIKE = 7, 0.55, 0.2
 #: Numbers of samples over which a parabola replaces the speeds, at most a quarter of a second, and the fewest changes of speed
 #: that tell their noise.
 _WINDOWS, _FEWEST = (5, 9, 25, 63), 100
-#: Share of what is left of a current, at most, that a longer window must leave: less than that is how a motion is cut off.
+#: A longer window is taken only if it leaves at most this share of the current's residual; a smaller gain may come from
+#: cutting off motion.
 _LESS = 0.9
 
 

@@ -112,7 +112,7 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
 
 
 def _late(diagnosis: Diagnosis) -> list[str]:
-    """A reference force of another time, which is no error of the brake's."""
+    """The reference force is late, which is no error of the brake."""
     late_s = diagnosis.reference_late_s
     if late_s < _SAID_S:
         return []
@@ -120,7 +120,7 @@ def _late(diagnosis: Diagnosis) -> list[str]:
 
 
 def _apart(diagnosis: Diagnosis) -> list[str]:
-    """Current and motion of two times: no cause comes after what it does."""
+    """Current and motion differ in time, where the cause would come after its effect."""
     late_ms = 1e3 * diagnosis.bench.current_late_s
     if not late_ms:
         return []
@@ -132,7 +132,7 @@ def _apart(diagnosis: Diagnosis) -> list[str]:
 
 
 def _dead(diagnosis: Diagnosis) -> list[str]:
-    """A sensor that says nothing of small currents."""
+    """The current sensor has a dead band."""
     dead_A = diagnosis.bench.current_dead_A
     if not dead_A:
         return []
@@ -175,7 +175,7 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
         return []
     told = [f"{text.strip()} (gains {gain:.3g} N)" for gain, text in sorted(parts, key=lambda part: -part[0])[:_TOLD]]
     offset = diagnosis.recalibrated.get(OFFSET_FRICTION)
-    # Searched down to zero, which no machine has.
+    # The fit went down to zero, which no machine has.
     none = offset is not None and offset.value < _NO_FRICTION * offset.before
     turned = [
         "No friction is left, as if it drove the motor: is `scale: -1` of MotorAngle and MotorSpeed missing, or is the "

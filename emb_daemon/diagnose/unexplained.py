@@ -10,7 +10,7 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Evidence needed to say that something is left: mean relative gain over its standard error, over episodes.
 _SURE = 2.5
-#: Share of the residual's mean square from which a dependence is worth a word.
+#: Share of the residual's mean square from which a dependence is reported.
 _LEAST_SHARE = 0.05
 #: Residual over what the calibration achieved on its own data from which something is left: its figures scatter by a quarter
 #: from log to log and pad to pad, units by less. A dependence that adds less to what noise leaves of the means it is seen in

@@ -30,10 +30,10 @@ from emb_daemon.offline.recording import Recording, recording, simulate
 #: Time between residuals, and length of an episode, s: the model's errors last for about a minute.
 _EVERY_S, _EPISODE_S = 5.0, 30.0
 _PLACES = SIDE_BY_SIDE[CHANNEL_OF_HEAT]
-#: By which pads and disc may differ from their plates at the beginning, K. A log that begins warmer tells of what it does not
-#: hold.
+#: Largest difference between pads or disc and their backing plates at the beginning, K. In a log that begins warmer the
+#: temperatures follow from braking before it.
 _SETTLED_K = 10.0
-#: Fewer episodes tell nothing.
+#: Least number of episodes.
 _LEAST_EPISODES = 8
 #: What the heat chain fits besides `base_coordinates`, and how well it is known, as there.
 _FURTHER = (
@@ -91,7 +91,8 @@ class HeatBench(Bench):
         return result
 
     def model(self) -> Model:
-        """The calibration's heat balance, fitted until nothing is gained: what a fit leaves on its way is no term's."""
+        """The calibration's heat balance, fitted until nothing is gained: a residual of an unfinished fit must not become a
+        term."""
         base = [c for c in base_coordinates(self.calibration, []) if c.channel == CHANNEL_OF_HEAT]
         further = [scaled_coordinate(self.calibration, [key], CHANNEL_OF_HEAT, prior) for key, prior in _FURTHER]
         start: dict[Coordinate, float] = {c: c.start for c in (*base, *further)}

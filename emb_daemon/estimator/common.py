@@ -82,7 +82,7 @@ def _to_odds(part, total):
 
 @njit
 def forget_common(s: Record) -> None:
-    """Nothing is known of pads, rotor and unit but the calibration."""
+    """Begin with the calibration alone: prior odds for pads, rotor and unit."""
     s.common = s.common_before = 0.0
     s.pads_odds, s.rotor_odds, s.unit_odds = PADS_ODDS, OTHERS_ODDS, OTHERS_ODDS
 
@@ -92,7 +92,7 @@ def _weighed(s, p, x, P, pads_odds, rotor_odds, unit_odds):
     """`common_variance` of a hypothesis with the errors ``x`` and their covariance ``P``."""
     own = P[SCALE, SCALE] + sq(max(p.stiffness_relative_sigma, _LEAST))
     stiffness = s.scale * (1.0 + x[SCALE]) - 1.0
-    # Of the inertia what motion has shown: a prior that is believed is no evidence that the rotor is the calibration's.
+    # Of the inertia only what motion has shown counts: its prior is no evidence that the rotor is the calibration's.
     shown = max(1.0 - P[INERTIA, INERTIA] / sq(INERTIA_SIGMA), _UNSHOWN)
     rotor, unsure = x[INERTIA] / shown, P[INERTIA, INERTIA] / shown
     return common_variance(stiffness, x[GAIN], rotor, own, unsure, pads_odds, rotor_odds, unit_odds)
@@ -111,8 +111,8 @@ def weigh_common(s: Record, p: Record) -> None:
 
 @njit
 def follow_common(s: Record, p: Record, dt: float) -> None:
-    """What a change believes that is proven but for the release, now and then within a stop: it may last, and be the first.
-    What speaks against others counts at its end."""
+    """Within a stop, every `_FOLLOWED_S`: weigh the common share by a change that is proven but for the release, because a
+    stop may be long, or the first. The odds of other pads, rotors and units are kept at the stop's end only."""
     s.common_age_s += dt
     if s.common_age_s > _FOLLOWED_S:
         s.common_age_s, s.common, a = 0.0, s.common_before, likeliest(s)

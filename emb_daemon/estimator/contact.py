@@ -121,7 +121,7 @@ def place_contact(s: Record, p: Record, released: float) -> None:
     start_anew(s.contact)
     s.contact.lost = False
     open_again(s, p)
-    # Whatever was believed before it.
+    # Going back (`estimator.rewind`) must not restore what was believed before this.
     keep_all(s)
 
 

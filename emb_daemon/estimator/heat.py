@@ -187,7 +187,7 @@ def heat(s: Record, p: Record, m: Record) -> None:
             s.power = max(m.brake_torque, 0.0) * wheel_speed
         s.heat_energy += s.power * m.dt
     if touching and speed_sigma > 0.0:
-        # What cannot be seen to heat may have heated all the same.
+        # Braking heat that an uncertain wheel speed hides counts in the temperature's sigma.
         unseen = friction_power(t, s.fused, speed_sigma, 0.5 * (s.pads[0, 0] + s.pads[1, 0]))
         s.temperature_sigma += unseen * m.dt / t.disc_heat_capacity
     if s.heat_time >= _HEAT_STEP_S:

@@ -177,7 +177,7 @@ def _open(s, p, kind):
     a.least, a.prior = _least_odds(s, kind), _first_odds(s, kind)
     a.log_odds = a.prior
     if p.clearance_sigma == 0.0:
-        # A brake that is held as exactly known has no change.
+        # A brake that is held as exactly known has no hypothesis of a change.
         a.log_odds = -np.inf
     a.shift = a.age_s = a.told = 0.0
     a.kind = kind
@@ -491,7 +491,7 @@ def _follow_contact(s):
 
 @njit
 def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
-    """Prove or reopen. Returns whether an alternative became the first hypothesis.
+    """Accept a proven alternative as the first hypothesis, or open alternatives anew. Returns whether one was accepted.
 
     While the pads touch, changes of contact, stiffness and torque offset look alike; the release separates them, so that
     nothing is proven before. The mixture follows at once."""

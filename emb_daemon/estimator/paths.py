@@ -88,7 +88,7 @@ def stiffness_path(s: Record, p: Record, m: Record, factor: float) -> None:
     x = position(s, p, m)
     dt = m.dt
     if dt > ONE_CYCLE_S:
-        # Over a gap the way is unknown but for its end, which the speed tells and the lag remembers best.
+        # Over a gap only the end of the way is known, from the speed; the lag depends on it most.
         dt = min(0.5 * m.dt, 2.0 * p.relaxation_time)
         _deform(s, p, x - dt * m.speed * s.gear_slope, m.dt - dt, factor)
     _deform(s, p, x, dt, factor)
@@ -96,7 +96,7 @@ def stiffness_path(s: Record, p: Record, m: Record, factor: float) -> None:
 
 @njit
 def _deform(s, p, x, dt, factor):
-    """The pads move steadily to ``x`` rad past contact within ``dt`` s."""
+    """Advance the force: the pads move at a constant speed to ``x`` rad past contact within ``dt`` s."""
     static, slope = characteristic_curve(x, p.curve)
     travel = max(x, 0.0) - max(s.past_contact, 0.0)
     s.past_contact = x

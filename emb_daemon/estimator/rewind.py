@@ -41,7 +41,7 @@ def _copy(a, s):
 
 @njit
 def keep_all(s: Record) -> None:
-    """Nothing was learned before."""
+    """At the start, or after going back: every stop in the store gets what is known now."""
     for i in range(STOPS):
         _copy(s.learned[i], s)
 
@@ -56,7 +56,7 @@ def keep(s: Record) -> None:
 
 @njit
 def go_back(s: Record, p: Record) -> None:
-    """Know what was known some stops ago, and suspect nothing."""
+    """Return to what was known `STOPS` stops ago, with all hypotheses of a change opened anew."""
     # Neither a delay nor a filter changes what the clearance shows of the offset.
     offset, variance = s.error[OFFSET], s.covariance[OFFSET, OFFSET]
     _know(s, s.learned[0])

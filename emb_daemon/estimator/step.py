@@ -94,7 +94,7 @@ def _start(s, p, m):
         else:
             doubt_memory(s, p, AT_A_START, 0.0)
     s.gear_zero = m.angle
-    # A motor that turns already comes from where nobody knows.
+    # Of a motor that turns at the first sample the released position is unknown.
     s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
@@ -128,8 +128,8 @@ def step(s: Record, p: Record, m: Record, out: Record) -> None:
 
 @njit
 def _lead(s, p, m, angle, speed, out):
-    """From the moment to which the sample was moved back to that in which ``angle`` (rad) and ``speed`` (rad/s) came: the pads
-    go on to where the motor is now."""
+    """Carry the force forward from the moment to which the sample was delayed to that in which ``angle`` (rad) and ``speed``
+    (rad/s) came: the pads move on to where the motor is now."""
     delay, filtered = CYCLE_S * s.alignment.delay, CYCLE_S * max(-s.alignment.lag, 0.0)
     apart = abs(delay) + filtered
     way = angle - m.angle + filtered * speed if delay > 0.0 else apart * speed
@@ -152,7 +152,7 @@ def _advance(s, p, m, angle, speed, out):
     moved_zero = follow_zero(s, p, m, turned)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         sigma = sqrt(s.covariance[CONTACT, CONTACT])
-        # What stands in for a speed does not flicker.
+        # A speed that replaces a wrong one has no noise, and must not pass for one that repeats.
         before, limit = np.nan if s.speed_wrong else s.speed, s.plausibility.limit
         watch(s.plausibility, m, s.angle, before, turned, s.past_contact, sigma, s.contact.confirmed)
         if s.plausibility.limit > 0.0 and limit == 0.0 and p.clearance_sigma > 0.0:

@@ -114,7 +114,7 @@ def _rest(s, p, travel, turned, dt):
         return
     slip, variance = a.rest_travel - a.rest_turned, sq(s.speed_sigma) * CYCLE_S * a.rest_s + sq(COUNTS_RAD)
     known, a.rate = a.rate != 0.0 or s.wander.found, 0.0
-    # Where both show the same, the motor may creep after all.
+    # Where angle and speed show the same motion, the motor may creep after all.
     if abs(slip) >= abs(a.rest_turned):
         take_offset(s.wander, a.rest_turned, variance, a.rest_s)
         if slip * slip > sq(_SHOWN) * variance:
@@ -129,8 +129,8 @@ def _rest(s, p, travel, turned, dt):
 
 @njit
 def _undo(s, p):
-    """The zero has drifted for a while: what the stops meanwhile have taught was wrong, and the contact is where it was before
-    beside what has strayed since."""
+    """The zero has drifted for a while: forget what the stops since have taught, and place the contact where it was before,
+    moved by what has strayed since."""
     strayed = s.wander.strayed
     s.wander.strayed = 0.0
     shift_places(s, strayed)
@@ -140,7 +140,8 @@ def _undo(s, p):
 
 @njit
 def _learn_share(a, strayed, moved, variance):
-    """What has ``strayed`` by so many rad of the angle has moved its zero by ``moved`` rad, with that variance."""
+    """Update the share of the straying that is the angle's fault: of ``strayed`` rad the zero has moved by ``moved`` rad,
+    known with ``variance`` rad²."""
     known = _variance(a) * strayed
     a.share = min(max(a.share + known * (moved - a.share * strayed) / (known * strayed + variance), 0.0), 1.0)
     a.told += strayed * strayed / variance
@@ -153,7 +154,7 @@ def attribute_straying(s: Record) -> None:
     strayed, walked = a.strayed * s.gear_slope, a.known + a.gained
     predicted = walked + _variance(a) * strayed * strayed
     if a.known > 0.0 and known < predicted:
-        # What the stop alone has told of the contact angle, and how well.
+        # What this stop alone says of the contact angle, and its variance: the posterior with the prediction taken out.
         whole = predicted / (predicted - known)
         moved, told = (contact - a.contact) * whole, known * whole
         _learn_share(a, strayed, a.share * strayed + moved, walked + told)

@@ -79,11 +79,11 @@ def _variance(i):
 
 @njit
 def _begin(u):
-    """Forget the phase; the odds stay."""
+    """Forget the disc's phase, as after a lost wheel angle; the odds that it is uneven stay."""
     u.known = True
     u.unseen = 0.0
     for i in range(STATES):
-        # An amplitude as large as before is possible again, at another phase.
+        # At the new phase amplitudes as large as those found are possible.
         size = sq(u.amplitude[i - i % 2]) + sq(u.amplitude[i - i % 2 + 1])
         u.gain[i] = _variance(i) + 0.5 * size
     for i in range(STATES):

@@ -202,9 +202,11 @@ def add_rest(P: Floats, p: Record, elapsed_s: float) -> None:
 
 @njit
 def _draw_near(x, P, gain, state, distance, reach):
-    """Take in that ``state`` is ``distance`` from what the calibration says and cannot be far from it."""
+    """Kalman update with the prior knowledge that ``state`` is within ``reach`` (standard deviation) of the calibration, from
+    which it is ``distance`` away now; both in the state's unit."""
     if P[state, state] <= 0.0:
-        # Exactly known: a calibration without friction says that there is none to be off, and only some changes are of growth.
+        # A state without variance is held as exactly known: friction of a calibration without any, or growth in a hypothesis
+        # without it.
         return
     s, innovation = P[state, state] + reach * reach, -distance
     for i in range(len(x)):
@@ -217,7 +219,8 @@ def _draw_near(x, P, gain, state, distance, reach):
 
 @njit
 def _gain_reach(x, winding, housing):
-    """How far the motor torque can be from the calibration beside what heat explains, share: as far again."""
+    """Standard deviation of the motor torque's error (share) that is possible at all: the usual reach, and as much again as
+    heat explains."""
     return _GAIN_REACH + abs(x[FADE]) * winding + abs(x[HOUSING]) * housing
 
 
@@ -226,8 +229,9 @@ def stay_possible(
     x: Floats, P: Floats, gain: Floats, p: Record, contact_distance: float, scale: float, growth: float, creep: Floats,
     winding: float, housing: float,
 ) -> None:  # fmt: skip
-    """What a brake can be at all: ``contact_distance`` rad of the contact angle and ``scale`` of the stiffness are from the
-    calibration, ``growth`` rad/K and ``creep`` shares from none; ``winding`` and ``housing`` heat."""
+    """Keep the errors within what a brake can be at all. ``contact_distance``: rad of the contact angle from the
+    calibration's; ``scale``: stiffness over the calibration's; ``growth`` rad/K and ``creep`` (shares), zero as calibrated;
+    ``winding`` and ``housing`` heat."""
     _draw_near(x, P, gain, CONTACT, contact_distance + x[CONTACT], _CONTACT_REACH_M / p.gear_gain)
     _draw_near(x, P, gain, SCALE, scale * (1.0 + x[SCALE]) - 1.0, _SCALE_REACH)
     _draw_near(x, P, gain, GROWTH, growth + x[GROWTH], 2.0 * _GROWTH_JUMP_M_PER_K / p.gear_gain)
@@ -241,9 +245,9 @@ def stay_possible(
 
 @njit
 def excess(x: Floats, p: Record, caliper: float, winding: float, housing: float) -> float:
-    """Factor, 1 or more, by which errors are larger than a hypothesis with the errors ``x`` believes, because motor and
-    friction are by it what they cannot be, with a caliper of ``caliper`` degC and ``winding`` and ``housing`` heat. Its square
-    is what the squared distance from the calibration exceeds chance by (Birge, Phys. Rev. 40, 1932)."""
+    """Factor, 1 or more, on the standard deviation of a hypothesis with the errors ``x`` by which motor and friction would be
+    what no such brake has, with a caliper of ``caliper`` degC and ``winding`` and ``housing`` heat. Its square is the excess
+    of the squared distance from the calibration over what chance explains (Birge, Phys. Rev. 40, 1932)."""
     thick = thickening(caliper)
     far = abs(x[GAIN]) / _gain_reach(x, winding, housing)
     far = max(far, abs(x[INERTIA]) / INERTIA_REACH, abs(x[SLOW]) / _SLOW_JUMP)

@@ -39,15 +39,16 @@ _KEPT, _ENOUGH = 20.0, 6.0
 #: Least shift that is taken out, and least time constant, cycles. Half of one is within what the estimate allows for, and
 #: interpolation costs as much; a current that is late by a third looks like a filter of as much.
 _WORTH, _WORTH_SLOW = 0.6, 0.5
-#: Standard deviations of a torque that its changes must be off by on the average: for a shift three of a difference's, because
-#: some shift explains much of noise; for a filter, which does not, little over a difference's 1.4. The shortest that is undone
-#: makes two where changes are as small as may tell.
+#: RMS difference between the changes of both torques, in standard deviations of one torque, from which a shift or a filter is
+#: looked for. The difference of two changes has 1.4 by noise alone. For a shift it must be three times that, because some
+#: shift always explains much of noise; for a filter, which explains little of noise, somewhat more than 1.4. The shortest
+#: filter that is undone makes 2 where changes are just large enough to be compared.
 _BEYOND, _BEYOND_SLOW = 4.2, 1.75
 #: Least part of the sum of squares that a shift, or a filter of the current, must explain: a right one leaves a twentieth to
 #: a fifth, and friction that the calibration does not know, as of grease at -20 degC, has made a wrong one explain half. The
 #: same of a filter of the motion: a current that shows twice as much looks like one, and two thirds of it are explained.
 _EXPLAINS, _EXPLAINS_MOTION = 0.6, 0.8
-#: Cycles after a change of torque in which it still counts where torques are averaged (`models.contact`).
+#: Cycles for which a change of torque still counts in averaged torques (`models.contact`).
 _SETTLED = 16.0
 #: Samples that are kept, one more than the largest shift. A motor stands that moved by less than three counts of a resolver of
 #: 12 bit meanwhile, rad.

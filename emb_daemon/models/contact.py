@@ -136,8 +136,8 @@ def watch_closing(
 
 @njit
 def clearance_level(state: Record, sigma: float, offset: float, offset_sigma: float) -> tuple[float, float]:
-    """Torque in the clearance and its standard deviation, N m: as the clearance showed it to samples of standard deviation
-    ``sigma``, or else as the filter believes."""
+    """Torque in the clearance and its standard deviation, N m: the mean of the clearance's samples, each of standard deviation
+    ``sigma``, once there are enough; before that what the filter believes."""
     if state.samples < _SHOWN:
         return offset, offset_sigma
     return state.level, max(_CORRELATED * sigma / sqrt(state.samples), offset_sigma)

@@ -99,12 +99,12 @@ def turned_within(w: Record, age: float) -> float:
 
 @njit
 def friction_since(w: Record, state: float, mean: float, age: float, noise: float, presliding_angle: float) -> float:
-    """Mean friction state over the last cycle where the angle is ``age`` s old: from the ``state`` that this has come to, and
-    its ``mean`` over its last cycle, step by step as the speeds turn it over. Those within their ``noise`` rad/s add up to a
-    way once that is more than theirs.
+    """Mean friction state over the last cycle where the angle is ``age`` s old. Begins with the ``state`` at that angle and
+    its ``mean`` over the cycle before, and slides on by the speeds since. Speeds within their ``noise`` rad/s count only once
+    their sum exceeds what noise adds up to.
 
-    The state itself follows the angle alone: what noise turns over by mistake is forgotten when the angle has come, and no
-    hold keeps it."""
+    The stored state follows the angle alone, so that what noisy speeds turned over by mistake lasts only until the angle has
+    come."""
     steps, left = 0, age
     while steps < _KEPT - 2 and left > w.dt[(w.at - steps) % _KEPT] > 0.0:
         left -= w.dt[(w.at - steps) % _KEPT]
@@ -138,10 +138,11 @@ def speed_then(w: Record, age: float) -> float:
 
 @njit
 def way_beside(w: Record, travel: float, speed: float, before: float, age: float, dt: float) -> float:
-    """Way (rad) in ``dt`` s that a ``travel`` rad of the angle is held against: by ``speed`` rad/s and the one ``before``, or
-    by the speeds ``age`` s ago, of which LATELY ``w`` holds all but the newest, if the angle is known to be so late.
+    """Way (rad) in ``dt`` s by the speeds, to be compared with the ``travel`` rad of the angle: by ``speed`` rad/s and the one
+    ``before``, or, if the angle is known to be ``age`` s late, by the speeds ``age`` s ago, of which LATELY ``w`` holds all
+    but the newest.
 
-    The nearer one: what made the angle late may have made the speed so, too."""
+    Of the two the one nearer to ``travel``, because what made the angle late may have made the speed late as well."""
     now = 0.5 * (speed + before) * dt
     if age <= 0.0 or dt <= 0.0:
         return now
@@ -163,9 +164,9 @@ def unfilter(a: Record, m: Record) -> None:
 
 @njit
 def stand(a: Record, speed: float, noise: float) -> bool:
-    """Take the ``speed`` rad/s of a motor whose angle stays where it is; ``noise`` rad/s of one.
+    """Take a ``speed`` (rad/s, with a standard deviation of ``noise`` rad/s) of a motor whose angle does not move.
 
-    Returns whether the speed's offset is found to be another, which is taken off from the next sample on."""
+    Returns whether a new offset of the speed was found; it is subtracted from the next sample on."""
     if abs(a.stood * speed - a.standing) > _CERTAIN * noise * sqrt(a.stood * (a.stood + 1.0)):
         # The motor has begun to turn while its angle is late, or the offset has changed.
         a.standing = a.stood = 0.0
@@ -235,7 +236,7 @@ def _solve(sums, variance, age_sigma):
 
 @njit
 def find_filter(a: Record) -> bool:
-    """Whether the speed's filter is found to be another, which is undone from the next sample on."""
+    """Whether the speed's filter was found to have changed; the new one is undone from the next sample on."""
     filtered = min(max(a.filtered + a.ahead, 0.0), SLOWEST_S)
     if filtered == a.filtered:
         return False

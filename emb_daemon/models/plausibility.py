@@ -151,8 +151,8 @@ def watch(
 
 @njit
 def _look_for_limit(c, current, travel):
-    """Learn the limit of the current sensor: a ``current`` (A) that repeats while the motor turns. At the limit as much flows,
-    or more. A limit that the current exceeds was none."""
+    """Learn the current (A) beyond which the sensor does not measure: one that repeats to the bit while the motor turns. A
+    limit that a later ``current`` exceeds is forgotten."""
     c.pinned = c.pinned + 1 if c.idle > 0 and abs(travel) > _STANDS_RAD else 0
     needed = _PINNED if abs(current) < c.largest else _PINNED_AT_LARGEST
     c.largest = max(c.largest, abs(current))
@@ -204,14 +204,16 @@ def hold(
     friction_sigma: float, load_sigma: float, presliding_angle: float,
 ) -> int:  # fmt: skip
     """How often the motor must have turned although the angle stands: number of times that the smoothed torque rose or fell by
-    more than friction at rest carries in both directions under a clamp force of ``force`` N, as far as what the load adds to
-    it turns over within that angle. A single swing may be an offset of the current, a swing back cannot.
+    more than friction at rest can carry, from fully one way to fully the other, under a clamp force of ``force`` N. Of the
+    friction that the load adds only what turns over within a resolver's counts is subtracted. A single swing may be an offset
+    of the current, a swing back cannot.
 
     Standard deviations, N m: ``sigma`` of the smoothed torque by its noise, ``friction_sigma`` of the friction, ``load_sigma``
     of what the load changes by while the motor stands; ``presliding_angle`` rad."""
     c.held_low, c.held_high = min(c.held_low, c.steady), max(c.held_high, c.steady)
     turned_over = 1.0 - exp(-_PRESLIDING_TURNS * _STANDS_RAD / presliding_angle)
-    # Seals and bearings stick as they like; what the load adds turns over with the angle.
+    # The offset friction (seals, bearings) may turn over in full without a motion; what the load adds turns over with the
+    # angle.
     loaded = turned_over * load_friction * max(force, c.held_high / gear_gain)
     carried = 2.0 * (1.0 + _STICTION) * (offset_friction + loaded)
     lasting = hypot(2.0 * friction_sigma, load_sigma)
@@ -231,7 +233,7 @@ def due(c: Record, acceleration: float, delay: float, dt: float) -> bool:
     lasting = min(acceleration, c.due_acceleration)
     c.due_acceleration = acceleration
     if c.held < 2:
-        # A motor that arrives and turns round is where it was a sample ago, whatever the acceleration.
+        # A motor that arrives and turns back within a sample is again where it was, whatever the acceleration.
         return False
     c.due_speed = c.due_speed + lasting * dt if lasting > 0.0 else 0.0
     c.due_angle += c.due_speed * dt

@@ -29,7 +29,7 @@ def turned_back(share: float, direction: float, travel: float, dt: float) -> flo
 def slid_angle(before: float, angle: float, flicker: float) -> float:
     """Angle that the gear has slid to: it follows ``angle`` once that leaves ``before`` by more than ``flicker`` rad.
 
-    Otherwise a reading that flickers between two counts at standstill would turn the friction state over again and again, and
+    Otherwise an angle that flickers between two counts at standstill would turn the friction state over again and again, and
     the direction from which the motor came would be lost.
     """
     return min(max(before, angle - flicker), angle + flicker)

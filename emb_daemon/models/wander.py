@@ -44,7 +44,7 @@ _LEAST_S, _MOST_S = 0.5, 2.0
 _KEPT_S = 40.0
 #: A motor stands below this speed, rad/s: ten times the noise of a resolver's speed.
 STANDING_RAD_PER_S = 3.0
-#: What may be at all, as weights: gain (share) and age (s) as `models.lateness` has them, any drift (rad/s) and loss (share).
+#: Priors as inverse variances: gain (share) and age (s) as `models.lateness` has them, drift (rad/s) and loss (share) unknown.
 _POSSIBLE = np.array([1.0 / 0.02**2, 1.0 / 0.01**2, 1.0 / 1.0**2, 1.0 / 0.1**2])
 #: Noise of a stretch beside the speed's: two counts of a 12-bit resolver, rad; and share of the way that the trapezoidal
 #: rule misses. A step a of the acceleration at the share x of a cycle T leaves a T² (x (1 - x) - 1/6) / 2, whose standard
@@ -76,8 +76,8 @@ def watch_wander(a: Record, travel: float, turned: float, speed: float, gained: 
 
 @njit
 def take_offset(a: Record, turned: float, variance: float, seconds: float) -> None:
-    """A motor that stood for ``seconds`` has ``turned`` by so many rad, with the variance ``variance`` rad², if its speed is
-    asked: this is the speed's offset."""
+    """Learn the speed's offset: a motor that stood for ``seconds`` has turned by ``turned`` rad (variance ``variance`` rad²)
+    by its integrated speed."""
     weight = seconds * seconds / variance
     a.offset_weight += weight
     a.offset_sum -= weight * turned / seconds

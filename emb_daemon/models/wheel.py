@@ -30,7 +30,8 @@ def track(s: Record, pulse: float, wheel_speed: float, dt: float) -> float:
     count = pulse + wraps * PULSE_MODULO
     if count != s.count:
         s.count = count
-        # It came at any time since the last sample, and the wheel has gone on: a fast disc would else be behind a slow one.
+        # The count came at some time since the last sample, and the wheel has turned on: without this a fast disc would lag
+        # more than a slow one.
         error = (s.count + 0.5) * width + 0.5 * wheel_speed * dt - s.turned
         # An error of more than two pulses is no interpolation error: frames were missing.
         s.turned += error if abs(error) > 2.0 * width + 0.02 * wheel_speed else _CORRECTION * error
