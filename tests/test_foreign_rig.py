@@ -769,6 +769,22 @@ def test_dates_and_structures_are_read_as_libraries_keep_them(tmp_path, ending):
     assert np.abs(log.samples["angle"] - columns["angle_rad"]).max() < 2e-4
 
 
+def test_batches_of_several_lengths_are_one_recording(tmp_path):
+    """Of a logger that empties its buffer now and then, and of a controller that goes through steps: part after part."""
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    plain, mapping = tmp_path / "plain.json", foreignkit.COLUMNS
+    foreignkit.write_rig(tmp_path, mapping)
+    plain.write_text(json.dumps({name: values.tolist() for name, values in columns.items()}))
+    whole = load_log(plain, read=Mapping(tmp_path / "mapping.yaml").read)
+    for name in columns:
+        mapping = mapping.replace(f"signal: {name}", f"signal: steps.graph.{name}")
+    (tmp_path / "mapping.yaml").write_text(mapping)
+    parts = [{name: values[first:last].tolist() for name, values in columns.items()} for first, last in ((0, 90), (90, None))]
+    steps = [{"name": "Finding", "graph": parts[0]}, {"name": "pause"}, {"name": "Clamping", "graph": parts[1]}]
+    (tmp_path / "steps.json").write_text(json.dumps({"steps": steps}))
+    _assert_same(load_log(tmp_path / "steps.json", read=Mapping(tmp_path / "mapping.yaml").read).samples, whole.samples)
+
+
 def test_stamps_of_json_lines_may_be_dates(tmp_path):
     rows = [{"at": f"2026-03-01T12:00:{second:02d}.500+01:00", "plate": 20.0 + second} for second in range(60)]
     (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, rows)))
