@@ -460,7 +460,7 @@ def _ramps(current: np.ndarray) -> np.ndarray:
         (_ramps, True),
         (lambda current: current, False),
         (lambda current: 0.5 * np.round(current / 0.5), False),
-        (lambda current: 0.4 * np.round(12.0 * np.sin(np.linspace(0.0, 6.0, len(current)))), False),
+        (lambda current: 0.4 * np.round(np.linspace(1.0, 23.0, len(current))), False),
         (lambda current: np.repeat(np.random.default_rng(1).normal(0.0, 5.0, len(current)), 5)[: len(current)], False),
     ],
     ids=["steps", "ramps", "measured", "in halves of an ampere", "a slow one in counts", "each value five times"],
