@@ -202,12 +202,13 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (f"{_HEADER},,Press,300\n{_table(100)}", "rows have 6 cells, the header 9; its last name nothing: Press, 300"),
         (f"{_HEADER}\ns,rad,rad/s,A,degC,g\n\n{_table(100)}", "force_N says g and is taken in N: which is right?"),
         (_OF_LINES + _table(100, "{t:.3f},1,{a:.1f},25.0,1.5,22,0"), ""),
+        ((_HEADER + "\n" + _table(100)).replace(",", "\r,").replace("\n", "\r\n"), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
         "two headers", "segments", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside",
         "late decimal commas", "quotes after blanks", "a typesetter's minus", "more names than cells",
-        "units above an empty line", "names of several lines",
+        "units above an empty line", "names of several lines", "columns put side by side",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
