@@ -461,14 +461,23 @@ def _ramps(current: np.ndarray) -> np.ndarray:
         (lambda current: current, False),
         (lambda current: 0.5 * np.round(current / 0.5), False),
         (lambda current: 0.4 * np.round(np.linspace(1.0, 23.0, len(current))), False),
+        (lambda current: np.concatenate([np.full(19 * len(current), -0.01), 0.5 * np.round(current / 0.5)]), False),
         (lambda current: np.repeat(np.random.default_rng(1).normal(0.0, 5.0, len(current)), 5)[: len(current)], False),
     ],
-    ids=["steps", "ramps", "measured", "in halves of an ampere", "a slow one in counts", "each value five times"],
+    ids=[
+        "steps",
+        "ramps",
+        "measured",
+        "in halves of an ampere",
+        "a slow one in counts",
+        "mostly at rest",
+        "each value five times",
+    ],
 )
 def test_a_command_in_place_of_the_measured_current_is_said(truth, made, said):
     columns = foreignkit.sampled(truth, 250.0)
-    time_ns = np.round(1e9 * columns["time_s"]).astype(np.int64)
-    lines = find_command(Series(time_ns, made(columns["current_A"])))
+    values = made(columns["current_A"])
+    lines = find_command(Series(4_000_000 * np.arange(len(values)), values))
     assert [line for line in lines if "as a command's do" in line] == lines and bool(lines) == said
 
 
