@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from diagnosekit import drives
 
-from emb_daemon.calibration.parameters import moved
+from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
 from emb_daemon.diagnose import confirmation, diagnosis, grammar, search
 from emb_daemon.diagnose.comparison import episodes_by_log
 from emb_daemon.diagnose.coordinates import TOLERATED
@@ -20,7 +20,7 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import Selection, find_changes, revise
-from emb_daemon.diagnose.text import verdict
+from emb_daemon.diagnose.text import _recalibration, verdict
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline import log_of
 from emb_daemon.offline.score import EpisodeErrors, rmse
@@ -78,6 +78,19 @@ def test_what_a_parameter_may_change_by_is_a_factor_up_or_down_beside_its_sigma(
     assert Recalibrated(1.0, value, sigma, "1", 5.0, "torque", tolerated=1.1).is_tolerance is granted
     assert Recalibrated(-1.0, -value, sigma, "1", 5.0, "torque", tolerated=1.1).is_tolerance is granted
     assert Recalibrated(0.0, value, sigma, "1", 5.0, "torque").is_tolerance, "of which nothing is known"
+
+
+@pytest.mark.parametrize(
+    ("value", "tolerated", "said"),
+    [(1.07, np.inf, "off by 2.14"), (0.2, np.inf, "begin again with 0.2 N·m/A"), (0.7, np.inf, ""), (1.07, 1.1, "")],
+    ids=["twice", "a motor's behind a gear", "another amplitude", "identified"],
+)
+def test_a_stated_torque_constant_that_no_supplier_states_is_asked_about(value, tolerated, said):
+    """The fit ends between it and what the logs show, as certain of itself as ever."""
+    found = Recalibrated(0.5, value, 0.05, "N·m/A", 900.0, "torque", tolerated)
+    text = " ".join(_recalibration(SimpleNamespace(recalibrated={TORQUE_CONSTANT: found})))
+    assert text.startswith("Recalibrated: torque constant 0.5 → ")
+    assert said in text and ("No supplier's torque constant" in text) == bool(said)
 
 
 def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):

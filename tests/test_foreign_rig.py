@@ -202,12 +202,13 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (f"{_HEADER},,Press,300\n{_table(100)}", "rows have 6 cells, the header 9; its last name nothing: Press, 300"),
         (f"{_HEADER}\ns,rad,rad/s,A,degC,g\n\n{_table(100)}", "force_N says g and is taken in N: which is right?"),
         (_OF_LINES + _table(100, "{t:.3f},1,{a:.1f},25.0,1.5,22,0"), ""),
+        ((_HEADER + "\n" + _table(100)).replace(",", "\r,").replace("\n", "\r\n"), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
         "two headers", "segments", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside",
         "late decimal commas", "quotes after blanks", "a typesetter's minus", "more names than cells",
-        "units above an empty line", "names of several lines",
+        "units above an empty line", "names of several lines", "columns put side by side",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
@@ -767,6 +768,22 @@ def test_dates_and_structures_are_read_as_libraries_keep_them(tmp_path, ending):
     log = load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
     assert log.time_s == pytest.approx(columns["time_s"] - columns["time_s"][0], abs=1e-5)
     assert np.abs(log.samples["angle"] - columns["angle_rad"]).max() < 2e-4
+
+
+def test_batches_of_several_lengths_are_one_recording(tmp_path):
+    """Of a logger that empties its buffer now and then, and of a controller that goes through steps: part after part."""
+    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+    plain, mapping = tmp_path / "plain.json", foreignkit.COLUMNS
+    foreignkit.write_rig(tmp_path, mapping)
+    plain.write_text(json.dumps({name: values.tolist() for name, values in columns.items()}))
+    whole = load_log(plain, read=Mapping(tmp_path / "mapping.yaml").read)
+    for name in columns:
+        mapping = mapping.replace(f"signal: {name}", f"signal: steps.graph.{name}")
+    (tmp_path / "mapping.yaml").write_text(mapping)
+    parts = [{name: values[first:last].tolist() for name, values in columns.items()} for first, last in ((0, 90), (90, None))]
+    steps = [{"name": "Finding", "graph": parts[0]}, {"name": "pause"}, {"name": "Clamping", "graph": parts[1]}]
+    (tmp_path / "steps.json").write_text(json.dumps({"steps": steps}))
+    _assert_same(load_log(tmp_path / "steps.json", read=Mapping(tmp_path / "mapping.yaml").read).samples, whole.samples)
 
 
 def test_stamps_of_json_lines_may_be_dates(tmp_path):

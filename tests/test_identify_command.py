@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import io
 import re
+from types import SimpleNamespace
 
 import foreignkit
 import numpy as np
@@ -14,7 +15,7 @@ from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError
-from emb_daemon.identify.campaign import load_campaign
+from emb_daemon.identify.campaign import RANDOM, Campaign, load_campaign
 from emb_daemon.identify.campaign_file import DiscCooling
 from emb_daemon.identify.run import identify
 from emb_daemon.logs import read
@@ -164,6 +165,17 @@ def test_a_disc_that_turns_otherwise_than_the_campaign_says_is_left_out(rig, tmp
     assert campaign.load_cooling(DiscCooling(log=log, disc_turns_per_s=2.0)) is None
     (fault,) = campaign.faults
     assert "disc_turns_per_s: expected 2 turns per second" in fault
+
+
+def test_a_log_that_is_too_short_says_how_long_one_must_be(rig, tmp_path, monkeypatch):
+    """A screw is driven home in a second and a half: that its samples are 4 ms apart is no fault of it."""
+    campaign = load_campaign(_campaign(tmp_path, rig, ""))
+    log = campaign.load(f"{rig}/static/random_6p5mm.log.gz", "random", "motion")
+    short = SimpleNamespace(samples=log.samples[:400], force_N=log.force_N[:400], time_s=log.time_s[:400])
+    monkeypatch.setattr(Campaign, "load", lambda *_: short)
+    assert campaign.load_motion("a.log", "random", "motion", reversals=RANDOM) is None
+    (fault,) = campaign.faults
+    assert "400 samples, one every 4 ms; expected 500 of them, two seconds; needed: motion; left out" in fault
 
 
 def test_a_force_that_no_such_brake_reaches_is_left_out(rig, tmp_path):

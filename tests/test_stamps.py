@@ -12,7 +12,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.contradictions import _find_late_force, contradictions, starts_anew
-from emb_daemon.logs.currents import other_current, other_motor
+from emb_daemon.logs.currents import find_command, other_current, other_motor
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.series import Series
@@ -442,6 +442,52 @@ def test_what_does_not_accelerate_the_motor_is_not_its_current(truth, tmp_path, 
     command = ["replay", str(tmp_path / "a.parquet"), "--mapping", str(tmp_path / "mapping.yaml")]
     assert main([*command, "--calibration", str(tmp_path / "calibration.yaml")]) == 0
     assert "the current does not accelerate the motor" in capsys.readouterr().err
+
+
+def _steps(current: np.ndarray) -> np.ndarray:
+    return np.repeat(current[::50], 50)[: len(current)]
+
+
+def _ramps(current: np.ndarray) -> np.ndarray:
+    rows = np.arange(len(current))
+    return np.interp(rows, rows[::50], current[::50])
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (_steps, True),
+        (_ramps, True),
+        (lambda current: current, False),
+        (lambda current: 0.5 * np.round(current / 0.5), False),
+        (lambda current: 0.4 * np.round(np.linspace(1.0, 23.0, len(current))), False),
+        (lambda current: np.concatenate([np.full(19 * len(current), -0.01), 0.5 * np.round(current / 0.5)]), False),
+        (lambda current: np.repeat(np.random.default_rng(1).normal(0.0, 5.0, len(current)), 5)[: len(current)], False),
+    ],
+    ids=[
+        "steps",
+        "ramps",
+        "measured",
+        "in halves of an ampere",
+        "a slow one in counts",
+        "mostly at rest",
+        "each value five times",
+    ],
+)
+def test_a_command_in_place_of_the_measured_current_is_said(truth, made, said):
+    columns = foreignkit.sampled(truth, 250.0)
+    values = made(columns["current_A"])
+    lines = find_command(Series(4_000_000 * np.arange(len(values)), values))
+    assert [line for line in lines if "as a command's do" in line] == lines and bool(lines) == said
+
+
+def test_a_command_is_said_of_a_table(truth, tmp_path, capsys):
+    columns = foreignkit.sampled(truth, 250.0)
+    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
+    table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"current_A": _steps(columns["current_A"])})
+    command = ["convert", str(table), "--mapping", str(tmp_path / "mapping.yaml"), "--output", str(tmp_path / "a.log")]
+    assert main(command) == 0
+    assert "% of CurrentQ's values stay as they are" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

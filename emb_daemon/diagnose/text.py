@@ -1,6 +1,8 @@
 """The verdict in words, for terminal and page."""
 
-from emb_daemon.calibration.parameters import OFFSET_FRICTION, in_words
+import numpy as np
+
+from emb_daemon.calibration.parameters import OFFSET_FRICTION, TORQUE_CONSTANT, in_words
 from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
@@ -24,6 +26,8 @@ _TOLD = 3
 _OTHER_PADS = 0.1
 #: Share of the friction as calibrated from which what is left of it is none.
 _NO_FRICTION = 1e-6
+#: Factor by which a supplier's torque constant may be off: a gear's loss of a fifth, and amperes by peak or RMS.
+_OF_A_SUPPLIER = 2.0**0.5 / 0.8
 #: Age of a reference that is said, s: half a cycle.
 _SAID_S = 0.002
 NAMES = {
@@ -181,7 +185,22 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
         "No friction is left, as if it drove the motor: is `scale: -1` of MotorAngle and MotorSpeed missing, or is the "
         "current another than the motor's?"
     ]
-    return [f"Recalibrated: {', '.join(told)}.", *(turned if none else [])]
+    return [f"Recalibrated: {', '.join(told)}.", *(turned if none else []), *_other_constant(diagnosis)]
+
+
+def _other_constant(diagnosis: Diagnosis) -> list[str]:
+    """A torque constant that was stated, and moved by more than what is stated may be off; one that was identified has a
+    tolerance."""
+    found = diagnosis.recalibrated.get(TORQUE_CONSTANT)
+    if found is None or np.isfinite(found.tolerated) or not found.before:
+        return []
+    ratio = found.value / found.before
+    if 1.0 / _OF_A_SUPPLIER < ratio < _OF_A_SUPPLIER:
+        return []
+    return [
+        f"No supplier's torque constant is off by {ratio:.3g}: is it that of the motor without its gear, or are current, "
+        f"force or gear gain in another unit? The stated one still holds it back: begin again with {found.value:.3g} N·m/A."
+    ]
 
 
 def _no_tolerance(diagnosis: Diagnosis) -> list[str]:

@@ -196,6 +196,8 @@ class Campaign:
             lacking = f"{len(log.samples)} samples, one every {1e3 * apart:.0f} ms"
             if cycle > _LONGEST_CYCLE_S:
                 lacking += ", and the way between two is unknown; expected 100 Hz or a slower motion"
+            else:
+                lacking += f"; expected {_LEAST_SAMPLES} of them, two seconds"
         elif not force_N > _LEAST_FORCE * actuator.rated_clamp_force_N:
             lacking = f"clamp force reaches only {1e-3 * force_N:.2f} kN of {1e-3 * actuator.rated_clamp_force_N:.0f} kN"
         elif _runs_against(log):

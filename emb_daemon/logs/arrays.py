@@ -138,17 +138,23 @@ def _add(columns: dict[str, np.ndarray | list[object]], name: str, variable) -> 
             _add(columns, _within(name, key), value)
         return
     if isinstance(variable, list):
-        if variable and all(isinstance(row, dict) for row in variable):
-            keys = dict.fromkeys(key for row in variable for key in row)
-            _add(columns, name, {key: [row.get(key) for row in variable] for key in keys})
+        if any(variable) and all(row is None or isinstance(row, dict) for row in variable):
+            rows = [row or {} for row in variable]
+            keys = dict.fromkeys(key for row in rows for key in row)
+            _add(columns, name, {key: [row.get(key) for row in rows] for key in keys})
             return
         if any(isinstance(value, str) for value in variable):
             columns[name] = [value if value is None else str(value) for value in variable]
             return
+        parts = [part for part in variable if part is not None]
+        if all(isinstance(part, list) for part in parts) and len({len(part) for part in parts}) > 1:
+            # Batches of a buffer, steps of a sequence: one recording, part after part.
+            _add(columns, name, [value for part in parts for value in part])
+            return
         try:
             variable = np.array(variable, float)
         except (TypeError, ValueError):
-            # Lists of several lengths and objects among numbers are no column.
+            # Objects among numbers are no column.
             return
     variable = np.asarray(variable).squeeze()
     if variable.dtype.names:

@@ -11,6 +11,7 @@ from emb_daemon.logs.currents import (
     AGAINST,
     JUDGED,
     LEAST,
+    find_command,
     find_driving_friction,
     find_late_current,
     find_other_current,
@@ -95,6 +96,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         if not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
     lines += _find_gaps(own)
+    lines += find_command(current) if current is not None else []
     lines += _find_staying(angle, force) if angle is not None and force is not None and not bare else []
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):

@@ -35,6 +35,11 @@ _SAME_SHARE, _OTHER_CURRENT = 0.1, 1.25
 #: Correlation, and share of the inertia, below which the current does not accelerate the motor, and least share of the current
 #: that acceleration would then need.
 _NO_INERTIA, _MUCH = 0.5, 0.5
+#: Share of a current's samples, where it does not rest, that stay or go on exactly straight from which nobody measured it: of
+#: 23 commands of two drives 0.96 and more do, of the currents that the same drives measured at most 0.2, of a column of which
+#: each value stands twice a half. By how much straight is exact, and how far a step goes at least, as shares of the range, so
+#: that it is not the count of a coarse sensor; least number of steps, or of samples that climb.
+_NOT_MEASURED, _EXACT, _STEP, _STEPS, _CLIMBS = 0.9, 1e-6, 0.05, 3, 20
 
 
 def _in_motion(samples: Records, beside: np.ndarray) -> np.ndarray:
@@ -153,6 +158,29 @@ def find_late_current(speed: Series, current: Series, force: Series | None) -> l
     moment = "is it a value of the moment? Then `mean_ms: 0`; or " if -late_ms * 1e6 < current.period_ns else ""
     told = f"CurrentQ comes {-late_ms} ms before {what} that it belongs to: {moment}{other} late?"
     return [f"{told} Then `mean_ms: {-2 * late_ms}` there"]
+
+
+def find_command(current: Series) -> list[str]:
+    """A line if the current's values stay to the bit and then jump, or climb exactly straight: a generator's, without the
+    ripple and the noise of a measured one."""
+    values, whole = current.values, np.ptp(current.values)
+    if len(values) < LEAST or not whole:
+        return []
+    # A drive that rests is without noise, too, at 0 or at the count beside it.
+    levels, counts = np.unique(values, return_counts=True)
+    on = values[1:-1] != levels[np.argmax(counts)]
+    steps = np.diff(values)
+    straight = np.abs(np.diff(steps)) <= _EXACT * whole
+    jumps = np.abs(steps[:-1][on & ~straight & (steps[:-1] != 0.0)])
+    climbs = np.sum(on & straight & (np.abs(steps[:-1]) > _EXACT * whole))
+    if np.sum(on) < LEAST or np.mean(straight[on]) < _NOT_MEASURED:
+        return []
+    if climbs < _CLIMBS and not (len(jumps) >= _STEPS and np.median(jumps) >= _STEP * whole):
+        return []
+    return [
+        f"{100 * np.mean(straight[on]):.0f} % of CurrentQ's values stay as they are or go on exactly straight, as a command's "
+        "do: the motor's own current, measured, has ripple, and is another where the drive does not follow"
+    ]
 
 
 def find_driving_friction(speed: Series, current: Series, force: Series | float) -> list[str]:

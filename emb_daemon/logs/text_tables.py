@@ -30,6 +30,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 #: A value that its line names, as a serial port's text does: ``Time: 5001 Force=3.2 N``; share of the first lines that must
 #: name the same values.
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
+#: A line's end before a separator.
+_LEFT_IN_CELLS = re.compile(rb"\r(?=[,;|\t])")
 #: A semicolon at the end of a line.
 _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
 #: A name in quotes of a few lines, which begins and ends a cell.
@@ -64,6 +66,8 @@ def read_text(path: Path, content: bytes, names: list[str]) -> Any:
     content = _as_utf8(content, names)
     if b"\n" not in content:
         content = content.replace(b"\r", b"\n")
+    # Where Windows' files of one column each were put side by side, a line's end is left in every cell.
+    content = _LEFT_IN_CELLS.sub(b"", content)
     content = _in_one_line(_unlabelled(_unterminated(content)))
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", PREAMBLE + _UNITS)[: PREAMBLE + _UNITS]
