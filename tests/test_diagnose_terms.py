@@ -438,6 +438,42 @@ def test_a_term_of_heat_must_explain_more_than_recalibration_alone(coupled, monk
     assert taken or "recalibrated" in found.candidates[name].reason
 
 
+@dataclasses.dataclass(frozen=True)
+class _OfHeat:
+    """What the gate of heat terms asks of a model: what is left of the temperatures (K²), however it was made."""
+
+    left_K2: float
+    bench: SimpleNamespace
+    values: dict = dataclasses.field(default_factory=dict)
+    fits: dict = dataclasses.field(default_factory=lambda: {"temperature": None})
+
+    def without(self, gone):
+        return self
+
+    def entered(self, values, chosen):
+        return self
+
+    def noise(self, channel):
+        return {"temperature": self.left_K2}[channel]
+
+
+@pytest.mark.parametrize(("gained_K2", "taken"), [(-0.01, False), (0.0, False), (0.01, True)])
+def test_a_term_of_heat_and_none_are_both_recalibrated_before_they_are_compared(calibration, monkeypatch, gained_K2, taken):
+    """As fitted, both leave the same; only recalibrated as they would be applied does the term gain, and a tie is none."""
+    bench = SimpleNamespace(
+        trials=[], calibration=calibration, calibrated=lambda known: calibration, under=lambda terms: bench
+    )
+    start = Selection(_OfHeat(4.0, bench), None)
+    term = Candidate(SimpleNamespace(name="term:heat"), "temperature", accepted=True)
+    monkeypatch.setattr(grammar.warmth, "heat_bench", lambda logs, calibration: bench)
+    monkeypatch.setattr(grammar, "search_heat", lambda bench: start.noted([term]))
+    left = lambda s: 3.0 - gained_K2 if s.accepted else 3.0  # noqa: E731
+    monkeypatch.setattr(grammar, "recalibrate_heat", lambda s: dataclasses.replace(s, model=_OfHeat(left(s), bench)))
+    found = grammar._with_heat_terms(start)
+    assert (found.accepted == ["term:heat"]) is taken
+    assert taken or "recalibrated" in found.candidates["term:heat"].reason
+
+
 @pytest.mark.parametrize(("port", "taken"), [("stiffness", True), ("thickness", False)])
 def test_a_term_is_taken_where_its_port_is_sure_though_its_signal_is_not(coupled, monkeypatch, port, taken):
     """Three fifths of the resampled episodes choose it: if the others choose another signal of its port, it is taken, and the
