@@ -5,6 +5,8 @@ Training is requested once per application of the park brake. Motion without a r
 too. The controller may then raise BrakeRequest for this motion, so BrakeRequest ends only a requested training.
 """
 
+from math import exp, log
+
 import numpy as np
 
 from emb_daemon.adapt import records as r
@@ -175,27 +177,45 @@ def _reset_fitted(x, P):
 
 
 @njit
+def _brake_of(s, p, kind):
+    """Contact angle over the filter's (rad), its variance, and log odds of a brake that is the filter's (0), one whose contact
+    has jumped since driving showed it (1), and one that drifts (2)."""
+    known = s.covariance[CONTACT, CONTACT]
+    if kind == 0:
+        return 0.0, known, 0.0
+    if kind == 1:
+        return 0.0, known + sq(contact_jump(p)), jump_odds(s)
+    drift = s.alternatives[DRIFT]
+    return drift.error[CONTACT], drift.covariance[CONTACT, CONTACT], drift_share_odds(s)
+
+
+@njit
 def _combine(s, p, moved, variance):
     """How far the contact angle moves when a stroke has found it ``moved`` rad from the filter's, with this ``variance``, and
     the variance that is left, rad^2.
 
-    Where both agree they are weighed by their variances. Otherwise three brakes may have made the stroke: the filter's, one
-    whose contact has jumped since driving showed it, and one that drifts. Their odds are those that driving left, times the
-    likelihood of ``moved``; the result has the mean and the variance of the mixture."""
-    known, drift = s.covariance[CONTACT, CONTACT], s.alternatives[DRIFT]
+    Where both agree they are weighed by their variances. Otherwise each brake of `_brake_of` may have made the stroke. Their
+    odds are those that driving left, times the likelihood of ``moved``; the result has the mean and the variance of the
+    mixture."""
+    known = s.covariance[CONTACT, CONTACT]
     if sq(moved) < sq(_AGREE) * (known + variance):
         return known / (known + variance) * moved, known * variance / (known + variance)
-    # Of each brake: what it expects, how well, and with which odds.
-    expected = np.array([0.0, 0.0, drift.error[CONTACT]])
-    own = np.array([known, known + sq(contact_jump(p)), drift.covariance[CONTACT, CONTACT]])
-    log_odds = np.array([0.0, jump_odds(s), drift_share_odds(s)])
-    both, off = own + variance, moved - expected
-    log_odds -= 0.5 * (off * off / both + np.log(both))
-    odds = np.exp(log_odds - log_odds.max())
-    odds /= odds.sum()
-    shift = expected + own / both * off
-    mean = (odds * shift).sum()
-    return mean, (odds * (own * variance / both + (shift - mean) ** 2)).sum()
+    likeliest = -np.inf
+    total = mean = square = 0.0
+    for kind in range(3):
+        expected, own, log_odds = _brake_of(s, p, kind)
+        off, both = moved - expected, own + variance
+        log_odds -= 0.5 * (off * off / both + log(both))
+        # Sums are kept relative to the likeliest so far: far apart, the likelihoods are no numbers.
+        before = exp(min(likeliest - log_odds, 0.0))
+        likeliest = max(likeliest, log_odds)
+        odds = exp(log_odds - likeliest)
+        shift = expected + own / both * off
+        total = before * total + odds
+        mean = before * mean + odds * shift
+        square = before * square + odds * (shift * shift + own * variance / both)
+    mean /= total
+    return mean, square / total - mean * mean
 
 
 @njit
