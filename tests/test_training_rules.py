@@ -10,7 +10,7 @@ from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, Evaluation,
 from emb_daemon.adapt.memory import entry_of
 from emb_daemon.calibration.parameters import CLEARANCE, value_of
 from emb_daemon.calibration.types import to_parameters
-from emb_daemon.estimator.hypotheses import DRIFT, PRIOR_ODDS, STIFFNESS_JUMP
+from emb_daemon.estimator.hypotheses import DRIFT, KEPT_JUMP, PRIOR_ODDS, STIFFNESS_JUMP, TORQUE_JUMP
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, new_state
 from emb_daemon.estimator.unknown import contact_jump
 from emb_daemon.models.fusion import (
@@ -631,6 +631,16 @@ def test_a_stroke_that_contradicts_driving_is_believed_by_what_may_have_happened
     assert np.mean(error**2) == pytest.approx(np.mean(combined[:, 1]), rel=0.05)
     weighed = known**2 / (known**2 + seen**2) * moved[apart] - truth[apart]
     assert np.mean(error**2) < min(np.mean(weighed**2), np.mean((moved - truth)[apart] ** 2))
+
+
+def test_what_spoke_for_a_jump_before_the_last_release_still_speaks_for_it():
+    state, p = _known_to(0.02, 0.02, PRIOR_ODDS, -6.0)
+    doubted, _ = training._combine(state, p, 0.3, 0.01)
+    state["alternatives"]["log_odds"][KEPT_JUMP] = 8.0
+    believed, left = training._combine(state, p, 0.3, 0.01)
+    assert doubted < 0.1 and believed == pytest.approx(0.3, rel=0.02) and left == pytest.approx(0.01, rel=0.05)
+    state["alternatives"]["kind"][KEPT_JUMP] = TORQUE_JUMP
+    assert training._combine(state, p, 0.3, 0.01)[0] == doubted, "a jump of the torque moves no contact"
 
 
 def test_a_stroke_that_agrees_with_driving_costs_it_nothing():
