@@ -128,6 +128,18 @@ def test_a_healthy_current_has_no_limit():
     assert not np.any(estimated(samples)["reasons"] & r.STUCK)
 
 
+def test_a_coarse_current_that_repeats_costs_no_accuracy():
+    """Counts of 1 A, of two standard deviations of its noise, seem to show a limit again and again; were the stroke forgotten
+    each time, 41 N and up to 0.7 kN were left."""
+
+    def coarse(rows):
+        rows["current_q"] = np.round(rows["current_q"])
+
+    estimates, force = city.changed(coarse, seed=3, seconds=60.0)
+    error = (estimates["force"] - force)[25:]
+    assert np.sqrt(np.mean(error**2)) < 35.0 and np.max(np.abs(error)) < 300.0
+
+
 @pytest.mark.parametrize("offset_A", [-4.0, 4.0])
 def test_current_with_an_offset_is_detected(offset_A):
     """4 A too much or too little under load, 5 kN of the torque path, for two seconds: said within a tenth of a second,

@@ -299,6 +299,17 @@ def test_at_the_largest_current_so_far_three_repetitions_are_enough():
     assert w.pass_by(4, speed=100.0, current=11.0) == AGREE and w.c["limit"][0] == 0.0
 
 
+def test_a_current_that_went_beyond_its_limit_repeats_by_chance_and_needs_five():
+    w = Watched()
+    w.pass_by(60, speed=100.0)
+    w.pass_by(4, speed=100.0, current=9.0)
+    assert w.c["limit"][0] == 9.0 and not w.c["coarse"][0]
+    w.pass_by(1, speed=100.0, current=12.0)
+    assert w.c["coarse"][0]
+    assert w.pass_by(4, speed=100.0, current=12.0) == AGREE and w.c["limit"][0] == 0.0
+    assert w.pass_by(1, speed=100.0, current=12.0) == TORQUE_FROZEN and w.c["limit"][0] == 12.0
+
+
 def test_a_current_that_repeats_while_the_motor_hardly_turns_has_no_limit():
     w = Watched()
     w.pass_by(60, speed=100.0)

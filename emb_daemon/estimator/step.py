@@ -155,7 +155,7 @@ def _advance(s, p, m, angle, speed, out):
         # A speed that replaces a wrong one has no noise, and must not pass for one that repeats.
         before, limit = np.nan if s.speed_wrong else s.speed, s.plausibility.limit
         watch(s.plausibility, m, s.angle, before, turned, s.past_contact, sigma, s.contact.confirmed)
-        if s.plausibility.limit > 0.0 and limit == 0.0 and p.clearance_sigma > 0.0:
+        if s.plausibility.limit > 0.0 and limit == 0.0 and not s.plausibility.coarse and p.clearance_sigma > 0.0:
             # The stroke's current up to here was less than what flowed.
             forget_stroke(s, p)
     other_speed = _follow_age(s, p, m, turned, moved_zero)

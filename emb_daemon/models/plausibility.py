@@ -26,9 +26,9 @@ from emb_daemon.jit import Record, fields, hypot, njit
 #: accelerates the motor. The angle has stood at ``held_angle`` (rad) for ``held`` samples; meanwhile ``steady`` swung
 #: ``swings`` times, the last time upwards (``swing`` 1) or downwards (-1); ``held_low``, ``held_high``: its least and largest
 #: value since the last swing. ``pinned``: samples in a row in which the current repeated to the bit while the motor turned;
-#: ``limit`` A: of either sign, as far as its sensor then goes, 0 if unknown; ``largest`` A: of either sign, so far.
-#: ``due_acceleration`` (rad/s²), ``due_speed`` (rad/s), ``due_angle`` (rad): motion that the torque must have caused since the
-#: angle stands.
+#: ``limit`` A: of either sign, as far as its sensor then goes, 0 if unknown; ``largest`` A: of either sign, so far;
+#: ``coarse``: whether a limit was exceeded. ``due_acceleration`` (rad/s²), ``due_speed`` (rad/s), ``due_angle`` (rad): motion
+#: that the torque must have caused since the angle stands.
 PLAUSIBILITY = np.dtype(
     [
         ("contradiction", "f8"),
@@ -40,6 +40,7 @@ PLAUSIBILITY = np.dtype(
         *fields("f8", "torque_mean torque_variance steady held_angle held_low held_high due_acceleration due_speed due_angle"),
         *fields("i8", "held swing swings pinned"),
         *fields("f8", "limit largest"),
+        ("coarse", "?"),
     ],
     align=True,
 )
@@ -74,7 +75,7 @@ _CERTAIN, _SURELY = 10.0, 3.0
 _STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
 #: Samples of a motor that turns in which the current repeats to the bit: its sensor goes no further. By chance, at one
 #: repetition in five, once in 3000; at the largest current so far fewer are as rare, and a motor that is asked to turn needs
-#: that for some cycles only.
+#: that for some cycles only. A sensor that has gone beyond such a limit repeats more often than that.
 _PINNED, _PINNED_AT_LARGEST = 5, 3
 #: Angle by which the torque must have turned the motor, rad, to contradict an angle that stands: eight times what a motor
 #: would get that turns back between two samples, if it were taken to start from rest. Torque beyond friction that noise may
@@ -152,13 +153,14 @@ def watch(
 @njit
 def _look_for_limit(c, current, travel):
     """Learn the current (A) beyond which the sensor does not measure: one that repeats to the bit while the motor turns. A
-    limit that a later ``current`` exceeds is forgotten."""
+    limit that a later ``current`` exceeds is forgotten, and the sensor is coarse."""
     c.pinned = c.pinned + 1 if c.idle > 0 and abs(travel) > _STANDS_RAD else 0
-    needed = _PINNED if abs(current) < c.largest else _PINNED_AT_LARGEST
+    needed = _PINNED if c.coarse or abs(current) < c.largest else _PINNED_AT_LARGEST
     c.largest = max(c.largest, abs(current))
     if c.pinned >= needed and c.current_flickered >= _FLICKERED:
         c.limit = abs(current)
     elif abs(current) > c.limit:
+        c.coarse = c.coarse or c.limit > 0.0
         c.limit = 0.0
 
 
