@@ -590,6 +590,29 @@ def test_a_cause_that_acts_by_temperature_has_no_season_but_in_a_batch():
         assert ("all units", cause) in {(o.where, o.cause) for o in findings.find(fleet, plain, "", factors, {}).seasons}
 
 
+def test_what_cannot_be_told_from_a_cause_that_acts_by_temperature_is_no_season():
+    """The first cause makes nearly the second one's force, so what the model's heat leaves unexplained may look like either."""
+    rng, fleet = np.random.default_rng(8), {}
+    for number in range(16):
+        unit, drives = f"unit-{number}", []
+        warmth = 15.0 + 6.0 * rng.standard_normal(12)
+        for day in range(12):
+            table = 50.0 * rng.standard_normal((200, 4))
+            table[:, 1] = 0.98 * table[:, 0] + 0.2 * table[:, 1]
+            amounts = np.array([0.0, 0.8, 0.5, 0.0]) * (warmth[day] - 15.0) / 10.0 + 0.05 * rng.standard_normal(4)
+            table = np.column_stack([table, table @ amounts + 20.0 * rng.standard_normal(200)])
+            drive = dataset.Drive(unit, "FL", "", day * 86_400_000_000_000, f"{day:016x}")
+            drives.append(scores.Score(drive, table.T @ table, 200, warmth[day]))
+        fleet[unit, "FL"] = drives
+
+    def seasons(thermal: str) -> set[str]:
+        causes = [scores.Cause(f"effects.{name}", name, None, "1", name in thermal) for name in "abcd"]
+        return {one.cause for one in findings.find(fleet, causes, "", {}, {}).seasons}
+
+    assert seasons(thermal="") == {"b", "c"}
+    assert seasons(thermal="a") == {"c"}
+
+
 def test_causes_that_act_by_temperature_are_known(calibration):
     thermal = {cause.name for cause in scores.Scorer(calibration).causes if cause.thermal}
     assert thermal == {

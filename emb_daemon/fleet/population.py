@@ -217,6 +217,16 @@ class Readings:
         size = np.einsum("ka,ab,kb->k", self.prints, self.inverse, self.prints)
         return (self.prints @ self.inverse @ total) ** 2 / np.maximum(size, 1e-300)
 
+    def rivals(self, total: np.ndarray, cause: int) -> tuple[int, ...]:
+        """Causes that explain nearly as much of a vector as ``cause``, the best one, and beside it little of it: a cause that
+        explains as much of another part of the vector is no rival."""
+        gains = self.gain(total)
+        own = self.prints[cause]
+        amount = own @ self.inverse @ total / max(own @ self.inverse @ own, 1e-300)
+        beside = self.gain(total - amount * own)
+        close = (gains >= _RIVAL * gains[cause]) & (beside <= (1.0 - _RIVAL) * gains)
+        return tuple(int(row) for row in np.flatnonzero(close) if row != cause)
+
 
 @dataclass(frozen=True)
 class Difference:
@@ -228,7 +238,7 @@ class Difference:
         chance: of a group, that of no difference, corrected for all tested groups and causes (Holm, Scandinavian J. of
             Statistics 6, 1979): a batch is recalled because of a single finding, so that none may be false. Of a unit the
             q-value over all (Benjamini and Hochberg): it is only inspected in a workshop, so a known share may be false.
-        rivals: causes that would explain nearly as much.
+        rivals: see `Readings.rivals`.
     """
 
     where: str | int
@@ -260,7 +270,7 @@ def shared_causes(
     Args:
         groups: masks of the units, shape (N,).
         beside: compare groups with all other units; otherwise with zero.
-        misfits: causes that are taken out of the units like others, but are no finding.
+        misfits: causes that are taken out of the units like others, but are no finding; nor is what cannot be told from one.
     """
     rows, prints = readings.ordinary, readings.prints
     chosen: list[tuple[str, int]] = []
@@ -272,29 +282,30 @@ def shared_causes(
             (np.outer(groups[g], prints[c]) * a for (g, c), a in zip(chosen, amounts, strict=True)), np.zeros_like(units)
         )
         best: tuple[float, str, int] | None = None
-        gains: dict[str, np.ndarray] = {}
+        contrasts: dict[str, np.ndarray] = {}
         for group, members in groups.items():
             inside, outside = left[members & rows], left[~members & rows]
             if len(inside) < LEAST_UNITS or (beside and len(outside) < LEAST_UNITS):
                 continue
             contrast = inside.mean(axis=0) - (outside.mean(axis=0) if beside else 0.0)
             weight = 1.0 / (1.0 / len(inside) + (1.0 / len(outside) if beside else 0.0))
-            gains[group] = weight * readings.gain(contrast)
-            if best is None or gains[group].max() > best[0]:
-                best = float(gains[group].max()), group, int(gains[group].argmax())
+            gains, contrasts[group] = weight * readings.gain(contrast), contrast
+            if best is None or gains.max() > best[0]:
+                best = float(gains.max()), group, int(gains.argmax())
         if best is None:
             break
         gain, group, cause = best
         amount = readings.of(left)[:, cause]
         inside, outside = amount[groups[group] & rows], amount[~groups[group] & rows]
         p_value, value, sigma = _compare(inside, outside if beside else None)
-        chance = min(1.0, p_value * (len(gains) * len(prints) - len(chosen)))
+        chance = min(1.0, p_value * (len(contrasts) * len(prints) - len(chosen)))
         if chance > SURE:
             break
-        rivals = tuple(int(c) for c in np.flatnonzero(gains[group] >= _RIVAL * gains[group].max()) if c != cause)
+        rivals = readings.rivals(contrasts[group], cause)
         chosen.append((group, cause))
         mismatch = gain < _SECOND * first.setdefault(group, gain)
-        found.append(None if mismatch or cause in misfits else Difference(group, cause, value, sigma, chance, rivals))
+        misfit = not {cause, *rivals}.isdisjoint(misfits)
+        found.append(None if mismatch or misfit else Difference(group, cause, value, sigma, chance, rivals))
         amounts = _together(units[rows], [(groups[g][rows], prints[c]) for g, c in chosen], readings, beside)
     return [replace(one, amount=float(amount)) for one, amount in zip(found, amounts, strict=True) if one]
 
@@ -340,9 +351,8 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Difference]:
     q_values = false_discovery_control(chances)
     found = []
     for row in np.flatnonzero(q_values <= FALSE_UNITS):
-        gains = readings.gain(deviations[row])
-        cause = int(gains.argmax())
-        rivals = tuple(int(c) for c in np.flatnonzero(gains >= _RIVAL * gains.max()) if c != cause)
+        cause = int(readings.gain(deviations[row]).argmax())
+        rivals = readings.rivals(deviations[row], cause)
         amount = float(amounts[row, cause])
         sigma = float(max(spread[cause], noise[row, cause]))
         found.append(Difference(int(row), cause, amount, sigma, float(q_values[row]), rivals))
