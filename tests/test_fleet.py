@@ -591,7 +591,7 @@ def test_a_cause_that_acts_by_temperature_has_no_season_but_in_a_batch():
 
 
 def test_what_cannot_be_told_from_a_cause_that_acts_by_temperature_is_no_season():
-    """The first cause makes nearly the second one's force, so what the model's heat leaves unexplained may look like either."""
+    """The first cause makes nearly the second one's force, so a misfit of the model's heat may look like either."""
     rng, fleet = np.random.default_rng(8), {}
     for number in range(16):
         unit, drives = f"unit-{number}", []

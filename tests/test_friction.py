@@ -1,6 +1,7 @@
 """Friction and the torque balance: what they say while the motor slides, and that they do not while it stands."""
 
 import brake
+import city
 import numpy as np
 import pytest
 from hypothesis import given
@@ -230,3 +231,20 @@ def test_friction_follows_of_a_noisy_angle_what_is_more_than_its_presliding(para
     # One that stands has not forgotten which way it came.
     paths._slid(s, p, 3.0 * way, 0.0, 0.004)
     assert s["direction"] == 2.0 * way
+
+
+@pytest.mark.parametrize(("hz", "way_rad", "current_A"), [(15.0, 0.005, 0.1), (14.0, 0.009, 0.1), (5.0, 0.004, 0.5)])
+def test_a_road_that_shakes_a_motor_which_holds_tells_nothing_of_friction(hz, way_rad, current_A):
+    """Friction that turns over in such swings would forget what it carries, and the current mean another force: 426 N."""
+
+    def shake(samples):
+        held = samples[city.HOLDING :]
+        turned = 2.0 * np.pi * hz * np.cumsum(held["dt"])
+        held["angle"] += way_rad * np.sin(turned)
+        held["speed"] += 2.0 * np.pi * hz * way_rad * np.cos(turned)
+        held["current_q"] += current_A * np.sin(turned + 1.0)
+
+    shaken, force = city.changed(shake)
+    good, _ = city.changed()
+    assert rmse(shaken["force"] - force) < 1.05 * rmse(good["force"] - force)
+    np.testing.assert_array_equal(shaken["reasons"], good["reasons"])

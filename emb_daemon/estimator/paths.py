@@ -33,6 +33,8 @@ _CERTAINLY = 3.0
 #: Share of friction's turning over that counts as its standard deviation where it is not known whether the gear slides: of all
 #: or nothing, one being as likely as the other.
 _SLID = 0.5
+#: Ways between two reversals, over the presliding angle, that are small swings: friction has not turned over in them.
+_SHORT = 1.0
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
@@ -259,6 +261,13 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     s.friction_state, mean, s.friction_variance = friction_state(
         before, variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
+    if slid * s.swing < 0.0:
+        s.swing_before, s.swing = abs(s.swing), 0.0
+    s.swing += slid
+    if s.swing_before < _SHORT * p.presliding_angle and abs(s.swing) < _SHORT * p.presliding_angle and slid != 0.0:
+        # Of small swings back and forth this friction forgets where it was, which a real contact may not (Dupont, Hayward,
+        # Armstrong, Altpeter, IEEE Trans. Automatic Control 47(5), 2002): it is anywhere between.
+        s.friction_variance = turned_unseen(variance, abs(slid), p.presliding_angle)
     if s.past_contact > 0.0:
         s.friction_variance = turned_unseen(s.friction_variance, _unseen(s, p, m), p.presliding_angle)
         if m.dt > ONE_CYCLE_S:

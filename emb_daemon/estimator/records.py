@@ -104,6 +104,9 @@ STATE = np.dtype(
         *fields("f8", "strayed turned turned_s behind"),
         # Way (rad) by which the zero has moved since ``away_s`` s, its variance (rad2), and that of the contact angle before.
         *fields("f8", "away away_variance away_s known_before"),
+        # Largest way (rad) in a sample by which angle and speed of late differed although the zero had not moved: while the
+        # motor turned, and while it stood.
+        ("largest_slip", "f8", (2,)),
         # Whether the speed of the last sample was not the motor's; ``speed`` is what was believed instead.
         ("speed_wrong", "?"),
         *fields("f8", "passed opposing angle speed angle_before dt_before contact_angle"),
@@ -121,6 +124,8 @@ STATE = np.dtype(
         # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late. What
         # effects have ``gained`` of thickness, m, and by how much that ``swelled`` or shrank in this sample.
         *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back gained swelled"),
+        # Way (rad) that the gear has slid since it last turned back, with its sign, and the way before that.
+        *fields("f8", "swing swing_before"),
         *fields("f8", "torque_age balance leverage"),
         # Motor torque (N m), gear gain and gear friction over the calibration's, as its effects have them at this sample.
         *fields("f8", "motor_torque gear_gain gear_friction"),

@@ -17,7 +17,7 @@ from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
 from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
-from emb_daemon.estimator.resolver import SPEED_MARGIN, at_rest, believe_speed, follow_zero
+from emb_daemon.estimator.resolver import MOST_SLIP_RAD, SPEED_MARGIN, at_rest, believe_speed, follow_zero
 from emb_daemon.estimator.rewind import forget_stroke, go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
@@ -104,7 +104,7 @@ def _start(s, p, m):
     forget_common(s)
     if s.resumed:
         weigh_common(s, p)
-    s.balance = np.nan
+    s.balance, s.largest_slip[:] = np.nan, MOST_SLIP_RAD
     keep_all(s)
 
 
