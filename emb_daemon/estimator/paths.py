@@ -245,6 +245,16 @@ def _unseen(s, p, m):
 
 
 @njit
+def _swings(s, p, slid):
+    """Whether the gear, which has ``slid`` on by so many rad, goes to and fro by less than turns friction over."""
+    short = _SHORT * p.presliding_angle
+    if slid * s.swing < 0.0:
+        s.swing_before, s.swing = abs(s.swing), 0.0
+    s.swing += slid
+    return slid != 0.0 and max(s.swing_before, abs(s.swing)) < short
+
+
+@njit
 def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     """Torque path over the cycle that ends at this sample.
 
@@ -261,12 +271,9 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     s.friction_state, mean, s.friction_variance = friction_state(
         before, variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
     )
-    if slid * s.swing < 0.0:
-        s.swing_before, s.swing = abs(s.swing), 0.0
-    s.swing += slid
-    if s.swing_before < _SHORT * p.presliding_angle and abs(s.swing) < _SHORT * p.presliding_angle and slid != 0.0:
-        # Of small swings back and forth this friction forgets where it was, which a real contact may not (Dupont, Hayward,
-        # Armstrong, Altpeter, IEEE Trans. Automatic Control 47(5), 2002): it is anywhere between.
+    if _swings(s, p, slid):
+        # Of small swings this friction forgets what it carried, which a real contact may not (Dupont, Hayward, Armstrong,
+        # Altpeter, IEEE Trans. Automatic Control 47(5), 2002): it is anywhere between.
         s.friction_variance = turned_unseen(variance, abs(slid), p.presliding_angle)
     if s.past_contact > 0.0:
         s.friction_variance = turned_unseen(s.friction_variance, _unseen(s, p, m), p.presliding_angle)
