@@ -233,7 +233,7 @@ def test_friction_follows_of_a_noisy_angle_what_is_more_than_its_presliding(para
     assert s["direction"] == 2.0 * way
 
 
-@pytest.mark.parametrize(("hz", "way_rad", "current_A"), [(15.0, 0.005, 0.1), (14.0, 0.009, 0.1), (5.0, 0.004, 0.5)])
+@pytest.mark.parametrize(("hz", "way_rad", "current_A"), [(15.0, 0.005, 0.1), (14.0, 0.007, 0.1), (5.0, 0.004, 0.5)])
 def test_a_road_that_shakes_a_motor_which_holds_tells_nothing_of_friction(hz, way_rad, current_A):
     """Friction that turns over in such swings would forget what it carries, and the current mean another force: 426 N."""
 
