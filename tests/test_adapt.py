@@ -833,6 +833,15 @@ def test_each_limit_of_the_evaluation_refuses(acceptable, limit, value, outcome,
     assert found.outcome == outcome and note in found.note
 
 
+@pytest.mark.parametrize("cycles", [-1, 1])
+def test_a_current_of_another_cycle_is_no_other_friction(ideal, cycles):
+    """Learned, friction that turns over within another angle cost 208 N where the delay was found and undone afterwards."""
+    rows = trained_rows(ideal)
+    rows["current_q"] = np.roll(rows["current_q"], cycles)
+    found = fit(rows, IDEAL)
+    assert found.outcome == r.OUT_OF_BOUNDS and "presliding angle" in found.note
+
+
 def test_pads_softer_than_any_that_were_calibrated_are_rejected(ideal):
     ideal["curve"] *= 0.5
     found = fit(trained_rows(ideal, high_rad=28.0), IDEAL)

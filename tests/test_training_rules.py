@@ -8,7 +8,7 @@ from emb_daemon.adapt import records as r
 from emb_daemon.adapt import training
 from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, Evaluation, learned_keys, why_out_of_bounds
 from emb_daemon.adapt.memory import entry_of
-from emb_daemon.calibration.parameters import CLEARANCE, value_of
+from emb_daemon.calibration.parameters import CLEARANCE, PRESLIDING_ANGLE, value_of
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator.hypotheses import DRIFT, KEPT_JUMP, PRIOR_ODDS, STIFFNESS_JUMP, TORQUE_JUMP
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, new_state
@@ -159,11 +159,11 @@ def test_what_the_temperature_may_be_wrong_by_now_and_before_is_in_the_factors_s
     np.testing.assert_allclose(0.8 * np.array(parts), [5e-3, 2e-3 * np.hypot(12.0, 4.0), 5e-3 + 2e-3 * np.hypot(12.0, 4.0)])
 
 
-def observe(parked, others_hold=True):
+def observe(parked, others_hold=True, rewinds=0):
     a, m, estimate, limits = parked
     rows, remembered, parameters = np.zeros(4, r.TRAINING), np.zeros(1, r.REMEMBERED), np.zeros(1, PARAMETERS)
     state = new_state()[0]
-    state["factor"] = 1.0
+    state["factor"], state["rewinds"] = 1.0, rewinds
     reached = new_state()[0]
     training.observe(a, state, parameters, parameters[0], reached, remembered, limits, others_hold, rows, m, estimate)
 
@@ -379,10 +379,11 @@ def test_a_wheel_that_turns_is_a_car_that_moves(parked, speed, moved):
     assert training._obstacle(*parked, True) == (r.VEHICLE_MOVED if moved else r.ACCEPTED)
 
 
-def advance(parked, rows=None, dt=0.25, remembered=None, force=0.0):
+def advance(parked, rows=None, dt=0.25, remembered=None, force=0.0, aligned=(0.0, 0.0, 0.0)):
     a, m, _, limits = parked
     m["dt"] = dt
     state, parameters = new_state()[0], np.zeros(1, PARAMETERS)
+    state["angle"], state["speed"], state["current_before"] = aligned
     state["factor"], state["effects"]["second_relaxation"]["force"] = 1.0, force
     rows = np.zeros(10, r.TRAINING) if rows is None else rows
     remembered = np.zeros(1, r.REMEMBERED) if remembered is None else remembered
@@ -428,18 +429,33 @@ def test_motion_without_request_that_ends_before_a_stroke_is_nothing(parked):
 
 
 def test_what_a_training_collects_is_what_the_path_models_read(parked):
-    """The current of a gap, which is of its last cycle alone, excepted; with what pads remembered when it began."""
+    """The current of a gap, which is of its last cycle alone, excepted; with what pads remembered when it began. Of signals
+    that came late it is what the estimator makes of them."""
     a, m, _, limits = parked
     a["still_time"], limits["high_force"], limits["longest_training"] = 0.0, 1e9, 1e9
-    shared = [name for name in r.TRAINING.names if name not in ("factor", "faded")]
+    aligned = {"angle": 11.0, "speed": 12.0, "current_q": 13.0}
+    shared = [name for name in r.TRAINING.names if name not in ("factor", "faded", *aligned)]
     for number, name in enumerate(shared):
         m[name] = True if name.startswith("has_") else 2.0 + number
     remembered = np.zeros(1, r.REMEMBERED)
-    rows = advance(parked, None, 0.004, remembered, 3.0)
+    rows = advance(parked, None, 0.004, remembered, 3.0, tuple(aligned.values()))
     assert all(rows[0][name] == m[name] for name in shared) and rows[0]["factor"] == 1.0
+    assert all(rows[0][name] == value for name, value in aligned.items())
     advance(parked, rows, 0.1, remembered, 4.0)
     assert remembered["second_relaxation"]["force"] == 3.0
-    assert not rows[1]["has_current"] and rows[1]["angle"] == m["angle"] and a["rows"] == 2
+    assert not rows[1]["has_current"] and rows[1]["caliper"] == m["caliper"] and a["rows"] == 2
+
+
+def test_a_training_ends_where_what_it_collected_is_found_to_be_wrong(parked):
+    """As by a current that comes late, which shows in fast strokes only. It may be asked for again."""
+    a, m, estimate, limits = parked
+    limits["enabled"] = True
+    limits["high_force"], limits["longest_training"], limits["answer_time"] = 1e9, 1e9, 1e9
+    a["rewinds"], a["rows"], estimate["torque_force"], m["dt"] = 3, 2, np.nan, 0.004
+    observe(parked, rewinds=3)
+    assert a["phase"] == r.ASKING
+    observe(parked, rewinds=4)
+    assert (a["phase"], a["outcome"], a["tried"], a["rewinds"]) == (r.IDLE, r.BAD_INPUT, False, 4)
 
 
 @pytest.mark.parametrize("stops", [0.0, 1.0])
@@ -674,12 +690,16 @@ def test_pads_that_moved_by_more_than_they_settle_are_others_though_their_curve_
     ids=["less", "too little", "more", "too much"],
 )
 def test_friction_at_full_force_changes_by_no_more_than_its_limit(change, fits):
-    """0.6 of what was calibrated, to either side; the clearance by as many radians to either side as its own limit says."""
+    """0.6 of what was calibrated, to either side; presliding as much, and a quarter more if the gear is softer; the clearance
+    by as many radians to either side as its own limit says."""
     calibration = adaptkit.shipped()
     values = {key: value_of(calibration, key) for key in learned_keys(calibration)}
     friction = {key: change * values[key] for key in (LOAD_FRICTION, OFFSET_FRICTION)}
     why = why_out_of_bounds(calibration, values | friction)
     assert (why == "") == fits and (fits or why.startswith("friction at full force"))
+    for change, fits in ((0.39, False), (0.41, True), (1.99, True), (2.01, False)):
+        why = why_out_of_bounds(calibration, values | {PRESLIDING_ANGLE: change * values[PRESLIDING_ANGLE]})
+        assert (why == "") == fits and (fits or why.startswith("presliding angle")), why
     for way in (-1.0, 1.0):
         for share in (0.99, 1.01):
             moved_rad = way * share * calibration.adaptation.clearance_change_rad

@@ -53,8 +53,9 @@ FOUND = ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma",
 #: ``generation`` identifies it. ``evaluation_ready``: the result is there, that is its outcome and, if it was accepted, what
 #: it `FOUND` (the contact angle's standard deviation is for the learned curve). ``ended`` requests that the outcome is logged
 #: and stored. ``force``: that of the torque path without the torque's offset, smoothed. ``holding``: whether the corner
-#: certainly clamps with its parking force at ``time_ns``. ``pulse``: count of the wheel's pulses when the car came to a stand.
-#: ``snapshot_wanted`` requests a snapshot of the estimator; the last one was at ``snapshot_ns``.
+#: certainly clamps with its parking force at ``time_ns``. ``rewinds``: see STATE, at the last estimate. ``pulse``: count of
+#: the wheel's pulses when the car came to a stand. ``snapshot_wanted`` requests a snapshot of the estimator; the last one was
+#: at ``snapshot_ns``.
 ADAPTER = np.dtype(
     [
         *fields("i8", "phase result outcome"),
@@ -63,7 +64,7 @@ ADAPTER = np.dtype(
         ("parked", "?"),
         ("snapshot_ns", "i8"),
         *fields("?", "snapshot_wanted holding"),
-        *fields("i8", "rows training_rows generation"),
+        *fields("i8", "rows training_rows generation rewinds"),
         *fields("?", "evaluation_wanted evaluation_ready"),
         ("evaluation", "i8"),
         *((name, "f8") for name in FOUND),

@@ -120,9 +120,10 @@ def _collect(a, s, remembered, rows, m):
         # Neither the training nor a start with unknown pads teaches it: other pads may look like a motor that fades.
         a.fade, a.housing_fade = (s.error[FADE], s.error[HOUSING]) if s.stops > 0.0 else (0.0, 0.0)
     row = rows[a.rows]
-    row.dt, row.angle, row.speed = m.dt, m.angle, m.speed
+    # As the estimator took them: those of a sample that belong to another moment are aligned.
+    row.dt, row.angle, row.speed = m.dt, s.angle, s.speed
     # The current is the mean of one cycle, and does not belong to the acceleration over a gap.
-    row.current_q, row.has_current = m.current_q, m.has_current and m.dt <= ONE_CYCLE_S
+    row.current_q, row.has_current = s.current_before, m.has_current and m.dt <= ONE_CYCLE_S
     row.wheel_speed, row.has_wheel_speed = m.wheel_speed, m.has_wheel_speed
     row.wheel_pulse, row.has_wheel_pulse = m.wheel_pulse, m.has_wheel_pulse
     row.caliper, row.has_thermocouple = m.caliper, m.has_thermocouple
@@ -311,6 +312,10 @@ def observe(
     if not limits.enabled:
         return
     obstacle = _obstacle(a, m, estimate, limits, others_hold)
+    if s.rewinds != a.rewinds and obstacle == r.ACCEPTED:
+        # What has been collected so far was found to be wrong, for example by a current that comes late.
+        obstacle = r.BAD_INPUT
+    a.rewinds = s.rewinds
     if obstacle == r.PARK_BRAKE_LEFT:
         a.tried = False
     if obstacle != r.ACCEPTED:

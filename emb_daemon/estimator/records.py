@@ -146,6 +146,8 @@ STATE = np.dtype(
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
         # What was known after each of the last stops, the oldest first.
         ("learned", LEARNED, (STOPS,)),
+        # How often the estimator has gone back to them.
+        ("rewinds", "i8"),
         # Whether the pads have touched since the last release; stops so far, and proven jumps of the stiffness path.
         ("braked", "?"),
         *fields("f8", "stops jumps"),

@@ -77,6 +77,7 @@ def forget_stroke(s: Record, p: Record) -> None:
 @njit
 def _know(s, a):
     """Know no more than ``a``, a LEARNED record."""
+    s.rewinds += 1
     copy_errors(s.error, s.covariance, a.error, a.covariance)
     s.error[CONTACT], s.error[SCALE] = a.contact_angle - s.contact_angle, a.scale / s.scale - 1.0
     s.error[GROWTH] = a.growth - s.growth
