@@ -334,7 +334,7 @@ class AdaptationLimits(Struct, kw_only=True):
     #: Relative amount by which the travel to high_force_N may be below that of the stiffest curve or above that of the
     #: softest.
     curve_change: Positive = 0.35
-    #: Largest relative change of the friction at high_force_N.
+    #: Largest relative change of the friction at high_force_N. The presliding angle may grow by a quarter more.
     friction_change: Positive = 0.6
     #: Largest change of the clearance.
     clearance_change_rad: Positive = 5.0
