@@ -192,3 +192,10 @@ def test_of_a_stroke_that_is_forgotten_the_stops_before_are_kept(s, parameters):
     assert _known(s) == pytest.approx(before) and s["error"][OFFSET] == offset
     assert np.all(s["alternatives"]["log_odds"] < 0.0)
     assert np.array_equal(s["learned"], earlier)
+
+
+@pytest.mark.parametrize("way", [go_back, forget_stroke])
+def test_who_collects_a_training_hears_of_it(s, parameters, way):
+    before = int(s["rewinds"])
+    way(s, brake.ideal(parameters))
+    assert s["rewinds"] == before + 1
