@@ -14,7 +14,7 @@ from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle
 from emb_daemon.diagnose.evidence import Evidence
 from emb_daemon.diagnose.model import LASTING, Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
-from emb_daemon.diagnose.screening import Q_VALUE, SLIDING, Candidate, Screening, groups
+from emb_daemon.diagnose.screening import Q_VALUE, SHADOW, SLIDING, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
@@ -204,9 +204,10 @@ def one_round(selection: Selection) -> Selection:
     tested = [screening.judge(model, c, rivals, found) for c in found]
     winners, losers = [], []
     for channel in model.bench.channels:
-        passed = [c for c in tested if c.channel == channel and not c.reason]
+        own = [c for c in tested if c.channel == channel]
+        passed = [c for c in own if not c.reason]
         if passed:
-            winner, beaten = _settle(model, passed)
+            winner, beaten = _settle(model, passed, [c for c in own if c.reason.endswith(SHADOW)])
             winners.append(winner)
             losers += beaten
     if not winners:
@@ -239,13 +240,14 @@ def _why_not_asked(effect: Effect, model: Model) -> str:
     return ""
 
 
-def _settle(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Candidate]]:
-    """The candidate to accept out of those that passed in one channel, and the others of equal gain with why they are not.
+def _settle(model: Model, passed: list[Candidate], shadows: list[Candidate]) -> tuple[Candidate, list[Candidate]]:
+    """The candidate to accept out of those that passed in one channel, and the others of equal gain with why they are not;
+    ``shadows``: those to which nothing was objected but that something explains much more.
 
     Two that these logs cannot tell apart, because neither says anything beside the other, are confounded: then the one
     that stands first in the catalogue, where simpler causes come first, is taken, and both are reported so. In the torque of
     a brake they are compared where friction slides: how it turns over is modelled roughly, and must not decide between
-    them."""
+    them. It may also make one of two a shadow, which is therefore asked as well."""
     best = max(passed, key=lambda c: c.evidence.gain)
     samples = SLIDING if model.bench.shows_turning(best.channel) else 1
     scale = 2.0 * model.inflation(best.channel) * model.noise(best.channel)
@@ -254,16 +256,18 @@ def _settle(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Cand
         evidence = model.evidence(own.channel, own.columns, beside.columns, samples)
         return evidence.p_value < Q_VALUE and evidence.gain > _SURE * scale
 
-    gains = {c.effect.name: model.evidence(c.channel, c.columns, samples=samples).gain for c in passed}
+    asked = [*passed, *shadows]
+    gains = {c.effect.name: model.evidence(c.channel, c.columns, samples=samples).gain for c in asked}
     most, rivals, beaten = gains[best.effect.name], [], []
-    for other in passed:
+    for other in asked:
         if other is best or gains[other.effect.name] < _CONFOUNDED * most or says(other, best):
             continue
         if says(best, other):
-            beaten.append(replace(other, reason=f"explained by {best.effect.name}, beside which it says nothing"))
+            reason = other.reason or f"explained by {best.effect.name}, beside which it says nothing"
+            beaten.append(replace(other, reason=reason))
         else:
             rivals.append(other)
-    equal = [best, *(rival for rival in rivals if gains[rival.effect.name] >= _EQUAL * most)]
+    equal = [best, *(rival for rival in rivals if not rival.reason and gains[rival.effect.name] >= _EQUAL * most)]
     winner = min(equal, key=lambda c: REGISTRY.index(c.effect))
     losers = [c for c in (best, *rivals) if c is not winner]
     beaten += [_confounded(winner, loser)[1] for loser in losers]
