@@ -36,7 +36,7 @@ def two(monkeypatch):
     ("hidden", "sure"),
     [
         ({"friction_asymmetry": {"asymmetry": 0.1}}, False),
-        ({"friction_asymmetry": {"asymmetry": -0.1}}, False),
+        ({"friction_asymmetry": {"asymmetry": -0.2}}, False),
         ({"current_offset": {"offset_A": 0.07}}, False),
         ({"current_offset": {"offset_A": -0.07}}, False),
         ({"current_offset": {"offset_A": -0.47}}, True),
