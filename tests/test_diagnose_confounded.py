@@ -43,8 +43,8 @@ def two(monkeypatch):
     ],
 )
 def test_what_the_calibration_knows_decides_and_the_other_is_said_unless_it_is_sure(calibration, hidden, sure):
-    """How friction turns over, modelled roughly, would name a positive offset an asymmetry, and a positive asymmetry an
-    offset."""
+    """How friction turns over, modelled roughly, would name a small positive offset an asymmetry, and a small positive
+    asymmetry an offset."""
     found = weigh_confounded(_searched(calibration, hidden))
     [name] = hidden
     [other] = NAMES - {name}
