@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import msgspec
@@ -29,6 +30,7 @@ from emb_daemon.diagnose import search
 from emb_daemon.diagnose.diagnosis import Diagnosis, diagnose
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, Bench
+from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.log import log_of
 from emb_daemon.offline.score import rmse
@@ -136,7 +138,8 @@ class Trial:
         unexplained: signal on which an unexplained residual depends, or None. contribution_error: of what the found effects do
         on their paths against what the hidden ones do, RMS over RMS; None where not exactly those were found. seconds: of CPU,
         for diagnose alone. left: by path; none in files of earlier versions. kelvin: RMS of the temperatures' residual on the
-        validation log, before and after. alike: by term, what the report names as equally likely, as terms' names.
+        validation log, before and after. alike: by finding, what the report names as equally likely or confounded with it, by
+        name.
     """
 
     seed: int
@@ -175,7 +178,7 @@ class Trial:
 
     @property
     def named_among_equals(self) -> bool:
-        """The same where a term also counts by what the report names as equally likely."""
+        """The same where a finding also counts by what the report names as equally likely, or as confounded with it."""
         return self._is_named(lambda found: [found, *self.alike.get(found, ())])
 
     def _is_named(self, told: Callable[[str], list[str]]) -> bool:
@@ -185,7 +188,7 @@ class Trial:
             return bool(self.found) and all(any(map(self._is_drawn, told(name))) for name in self.found)
         if self.kind == "foreign":
             return len(self.found) == 1 and not _SAME[next(iter(self.hidden))].isdisjoint(told(next(iter(self.found))))
-        return set(self.found) == set(self.hidden)
+        return any(sorted(names) == sorted(self.hidden) for names in product(*map(told, self.found)))
 
 
 def _without_number(term: str) -> str:
@@ -409,8 +412,15 @@ def run_trial(calibration: Calibration, seed: int, kind: str, names: tuple[str, 
         what_is_left(result, base, judging, seed + 2),
         tuple(f.effect.name for f in result.accepted if f.in_calibration),
         result.judged_residual.get("temperature"),
-        {f.effect.name: [":".join(["term", port, *signals]) for port, signals in f.alike] for f in new if f.alike},
+        {f.effect.name: equals for f in new if (equals := _equals(f))},
     )
+
+
+def _equals(finding: Candidate) -> list[str]:
+    """What the report says may be there instead of a finding, by name."""
+    if finding.made:
+        return [":".join(["term", port, *signals]) for port, signals in finding.alike]
+    return [finding.confounded_with] if finding.confounded_with else []
 
 
 def _contribution_error(bench: Bench, kind: str, hidden: dict, found: dict) -> float | None:

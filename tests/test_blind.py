@@ -58,6 +58,16 @@ def test_a_change_is_named_as_a_change_of_that_effect_and_no_other(found, change
 
 
 @pytest.mark.parametrize(
+    ("hidden", "named", "among_equals"),
+    [("current_offset", True, True), ("friction_asymmetry", False, True), ("viscous_friction", False, False)],
+)
+def test_an_effect_counts_among_equals_where_the_report_says_that_it_may_be_there_instead(hidden, named, among_equals):
+    found, alike = {"current_offset": {}, "backlash": {}}, {"current_offset": ["friction_asymmetry"]}
+    trial = blind.Trial(1, "pair", {hidden: {}, "backlash": {}}, 150.0, found, 90.0, 27.0, None, alike=alike)
+    assert trial.named is named and trial.named_among_equals is among_equals
+
+
+@pytest.mark.parametrize(
     ("alike", "among_equals"),
     [([], False), (["term:gear_gain:disc_temperature"], True), (["term:gear_friction:disc_temperature"], False)],
 )

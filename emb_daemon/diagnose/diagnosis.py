@@ -314,6 +314,8 @@ def _why(candidate: Candidate) -> str:
         text = f"not as calibrated: {text}"
     for disturbed, share in candidate.placebos.items():
         text += f"; {disturbed}: {100 * share:.0f} % of it"
+    if candidate.confounded_with:
+        text += f"; confounded with {candidate.confounded_with} on these logs; to separate them: {candidate.manoeuvre}"
     if candidate.channel == "innovation":
         text += "; from the difference of both paths: no reference was recorded"
     return text

@@ -285,6 +285,19 @@ class Model:
         plain = leave_out_within(moments.select(nuisances), penalty[:first], low, high) if rest else None
         return judge(moments, nuisances, list(range(first, len(penalty))), penalty, plain)
 
+    def log_posterior(self, channel: str, samples: int, scale: float) -> float:
+        """Of a channel's free coordinates where means over ``samples`` make them most probable, in nats but for a constant;
+        ``scale``: variance of an independent observation. What is new to the calibration has no prior and costs nothing."""
+        free, own = self.movable(channel), self.own(channel)
+        start = {c: self.centre.get(c, c.start) for c in free}
+        moments = self.moments(channel, [self.columns[c] for c in free], self.residual_at(channel, start), samples)
+        total = moments.products.sum(axis=0)
+        normal, right = total[:-1, :-1] + np.diag(scale / np.array([c.prior for c in free]) ** 2), total[:-1, -1]
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        moved = np.linalg.lstsq(normal / np.outer(size, size), right / size, rcond=1e-12)[0] / size
+        held = sum(((self.values[c] - self.centre.get(c, c.start)) / c.prior) ** 2 for c in own if c not in free)
+        return -0.5 * float((total[-1, -1] - moved @ right) / scale + held)
+
     def counted(self, channel: str) -> int:
         """Residuals of a channel that say something."""
         return max(int(np.count_nonzero(self.residual[channel])), 1)

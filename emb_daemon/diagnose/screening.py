@@ -41,7 +41,7 @@ Q_VALUE = 0.01
 _RESIDUAL_SHARE, _LASTING_SHARE, _SIGNAL_SHARE = 0.06, 0.2, 0.002
 #: Samples in the shortest means, which leave out where friction turns over. How friction turns over is modelled roughly; where
 #: it turns over late it looks like a friction that rises with speed.
-_SLIDING = 2
+SLIDING = 2
 #: What matters in a temperature (K), and of a brake torque's RMS: friction tables are not known better.
 _FLOOR_K, _TORQUE_SHARE = 1.5, 0.08
 #: Standard deviation of a thermocouple (IEC 60584, class 1: 1.5 K are two): what a heat balance need not do better.
@@ -235,7 +235,7 @@ class Screening:
             return replace(candidate, reason="no gain on left-out episodes")
         gain, where = candidate.gain, ""
         if model.bench.shows_turning(channel):
-            sliding = model.rms(model.evidence(channel, candidate.columns, samples=_SLIDING).gain, channel)
+            sliding = model.rms(model.evidence(channel, candidate.columns, samples=SLIDING).gain, channel)
             gain, where = min((gain, where), (sliding, " where friction slides"))
         if gain < floor:
             too_little = f"explains {gain:.3g} {unit} RMS{where}, too little to matter (limit {floor:.3g} {unit})"

@@ -23,6 +23,7 @@ from emb_daemon.diagnose.selection import (
     one_round,
     recalibrate_heat,
     revise,
+    weigh_confounded,
 )
 from emb_daemon.diagnose.unexplained import dependences, is_beyond
 from emb_daemon.effects import REGISTRY
@@ -64,7 +65,7 @@ def select(bench: Bench, progress: Progress) -> Selection:
 
 
 def _finished(selection: Selection) -> Selection:
-    return find_changes(revise(recalibrate_heat(selection)))
+    return find_changes(revise(weigh_confounded(recalibrate_heat(selection))))
 
 
 def _told(begin: Model) -> dict[Coordinate, float]:

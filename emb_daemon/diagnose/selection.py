@@ -14,7 +14,7 @@ from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle
 from emb_daemon.diagnose.evidence import Evidence
 from emb_daemon.diagnose.model import LASTING, Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
-from emb_daemon.diagnose.screening import Q_VALUE, Candidate, Screening, groups
+from emb_daemon.diagnose.screening import Q_VALUE, SHADOW, SLIDING, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import Effect
@@ -23,6 +23,9 @@ from emb_daemon.effects.base import Effect
 _CONFOUNDED = 0.8
 #: ... and are as good as each other from here.
 _EQUAL = 0.97
+#: Log-odds, 99 to 1, from which one of two explains what the other does not: the priors have a share in such a difference,
+#: which the jackknife over episodes does not know.
+_SURE = float(np.log(1.0 / Q_VALUE))
 #: A candidate whose chance is below this but not sure, and that explains this share of the mean square of what lasts of the
 #: residual, is fitted before it is judged. Not of all of it: what differs from sample to sample no effect explains, and in the
 #: current that is most.
@@ -201,9 +204,10 @@ def one_round(selection: Selection) -> Selection:
     tested = [screening.judge(model, c, rivals, found) for c in found]
     winners, losers = [], []
     for channel in model.bench.channels:
-        passed = [c for c in tested if c.channel == channel and not c.reason]
+        own = [c for c in tested if c.channel == channel]
+        passed = [c for c in own if not c.reason]
         if passed:
-            winner, beaten = _settle(model, passed)
+            winner, beaten = _settle(model, passed, [c for c in own if c.reason.endswith(SHADOW)])
             winners.append(winner)
             losers += beaten
     if not winners:
@@ -236,37 +240,38 @@ def _why_not_asked(effect: Effect, model: Model) -> str:
     return ""
 
 
-def _settle(model: Model, passed: list[Candidate]) -> tuple[Candidate, list[Candidate]]:
-    """The candidate to accept out of those that passed in one channel, and the others of equal gain with why they are not.
+def _settle(model: Model, passed: list[Candidate], shadows: list[Candidate]) -> tuple[Candidate, list[Candidate]]:
+    """The candidate to accept out of those that passed in one channel, and the others of equal gain with why they are not;
+    ``shadows``: those to which nothing was objected but that something explains much more.
 
     Two that these logs cannot tell apart, because neither says anything beside the other, are confounded: then the one
-    that stands first in the catalogue, where simpler causes come first, is taken, and both are reported so."""
+    that stands first in the catalogue, where simpler causes come first, is taken, and both are reported so. In the torque of
+    a brake they are compared where friction slides: how it turns over is modelled roughly, and must not decide between
+    them. It may also make one of two a shadow, which is therefore asked as well."""
+    best = max(passed, key=lambda c: c.evidence.gain)
+    samples = SLIDING if model.bench.shows_turning(best.channel) else 1
+    scale = 2.0 * model.inflation(best.channel) * model.noise(best.channel)
 
     def says(own: Candidate, beside: Candidate) -> bool:
-        evidence = model.evidence(own.channel, own.columns, beside.columns)
-        return evidence.p_value < Q_VALUE and evidence.gain > 0.0
+        evidence = model.evidence(own.channel, own.columns, beside.columns, samples)
+        return evidence.p_value < Q_VALUE and evidence.gain > _SURE * scale
 
-    best = max(passed, key=lambda c: c.evidence.gain)
-    rivals, beaten = [], []
-    for other in passed:
-        if other is best or other.evidence.gain < _CONFOUNDED * best.evidence.gain or says(other, best):
+    asked = [*passed, *shadows]
+    gains = {c.effect.name: model.evidence(c.channel, c.columns, samples=samples).gain for c in asked}
+    most, rivals, beaten = gains[best.effect.name], [], []
+    for other in asked:
+        if other is best or gains[other.effect.name] < _CONFOUNDED * most or says(other, best):
             continue
         if says(best, other):
-            beaten.append(replace(other, reason=f"explained by {best.effect.name}, beside which it says nothing"))
+            reason = other.reason or f"explained by {best.effect.name}, beside which it says nothing"
+            beaten.append(replace(other, reason=reason))
         else:
             rivals.append(other)
-    equal = [best, *(rival for rival in rivals if rival.evidence.gain >= _EQUAL * best.evidence.gain)]
+    equal = [best, *(rival for rival in rivals if not rival.reason and gains[rival.effect.name] >= _EQUAL * most)]
     winner = min(equal, key=lambda c: REGISTRY.index(c.effect))
-    for loser in (c for c in (best, *rivals) if c is not winner):
-        reason = (
-            f"confounded with {winner.effect.name} on these logs, which is simpler or explains more; to separate them: "
-            f"{loser.effect.manoeuvre}"
-        )
-        beaten.append(replace(loser, reason=reason, confounded_with=winner.effect.name, manoeuvre=loser.effect.manoeuvre))
-    if len(rivals):
-        other = next(c for c in (best, *rivals) if c is not winner)
-        return replace(winner, confounded_with=other.effect.name, manoeuvre=other.effect.manoeuvre), beaten
-    return winner, beaten
+    losers = [c for c in (best, *rivals) if c is not winner]
+    beaten += [_confounded(winner, loser)[1] for loser in losers]
+    return (_confounded(winner, losers[0])[0] if losers else winner), beaten
 
 
 def _try_unsure(selection: Selection, tested: list[Candidate], rivals: dict) -> Selection:
@@ -309,6 +314,57 @@ def _against(model: Model, effect: Effect, values: Values) -> Evidence:
     single = [model.evidence_against({c: values[c] for c in group}) for group in every] if len(every) > 1 else []
     chances = [evidence.p_value for evidence in (together, *single)]
     return replace(together, p_value=min(1.0, min(chances) * len(chances)))
+
+
+def weigh_confounded(selection: Selection) -> Selection:
+    """Of each accepted effect and the one with which it is confounded the one that stays which asks for less of what the
+    calibration knows, both fitted beside all that was found; the other is as likely unless the odds are 99 to 1.
+
+    Where friction slides, two causes may be the same torque if torque constant, inertia and friction follow. How far these
+    have to move from the calibration is all that can tell."""
+    for name in selection.accepted:
+        candidate = selection.candidates[name]
+        other = selection.candidates.get(candidate.confounded_with or "")
+        if candidate.made or other is None:
+            continue
+        if other.accepted:
+            # Both were proven, one beside the other.
+            selection = selection.noted([replace(candidate, confounded_with=None, manoeuvre=None)])
+            continue
+        channel = candidate.channel
+        instead = selection.without(name, "").entered([other])
+        if other.effect.name not in instead.accepted:
+            continue
+        models = selection.model, instead.model
+        samples = SLIDING if models[0].bench.shows_turning(channel) else 1
+        scale = min(model.inflation(channel) * model.noise(channel) for model in models)
+        own, others = (model.log_posterior(channel, samples, scale) for model in models)
+        winner, loser = (candidate, other) if own >= others else (other, candidate)
+        if own < others:
+            selection = instead
+        selection = selection.noted(_weighed(selection.candidates[winner.effect.name], loser, abs(own - others) > _SURE))
+    return selection
+
+
+def _weighed(winner: Candidate, loser: Candidate, sure: bool) -> list[Candidate]:
+    """Two that were confounded, with what is said of them once the odds are known."""
+    if sure:
+        reason = f"explained by {winner.effect.name}: for this the calibration would have to be off by more than it may be"
+        return [replace(winner, confounded_with=None, manoeuvre=None), replace(loser, reason=reason, confounded_with=None)]
+    return list(_confounded(winner, loser))
+
+
+def _confounded(winner: Candidate, loser: Candidate) -> tuple[Candidate, Candidate]:
+    """Two that these logs cannot tell apart, each with the other's name."""
+    reason = (
+        f"confounded with {winner.effect.name} on these logs, which is simpler or explains more; to separate them: "
+        f"{loser.effect.manoeuvre}"
+    )
+    apart = loser.effect.manoeuvre
+    return (
+        replace(winner, confounded_with=loser.effect.name, manoeuvre=apart),
+        replace(loser, accepted=False, reason=reason, confounded_with=winner.effect.name, manoeuvre=apart),
+    )
 
 
 def revise(selection: Selection) -> Selection:

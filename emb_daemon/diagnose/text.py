@@ -57,10 +57,12 @@ def _place(port: str, signals: tuple[str, ...]) -> str:
     return f"{' times '.join(signals).replace('_', ' ')} at {_PORTS.get(port, port)}"
 
 
-def _told(finding: Candidate) -> str:
-    """A finding with its numbers; a term with all that these logs cannot tell from it, which is as much a finding as it is."""
+def _told(diagnosis: Diagnosis, finding: Candidate) -> str:
+    """A finding with its numbers, and with all that these logs cannot tell from it, which is as much a finding as it is."""
     if not finding.made:
-        return f"{title(finding)} ({size(finding)})"
+        [*others] = (f for f in diagnosis.findings if f.effect.name == finding.confounded_with)
+        equals = "".join(f"; or instead {title(f)}, {size(f)}; what would tell: {finding.manoeuvre}" for f in others)
+        return f"{title(finding)} ({size(finding)}{equals})"
     others = " or ".join(_place(*place) for place in finding.alike)
     equals = f"; as likely it is of {others}; what would tell: {finding.manoeuvre}" if others else ""
     return f"{title(finding)} ({finding.effect.equation}{equals})"
@@ -93,9 +95,9 @@ def verdict(diagnosis: Diagnosis) -> str:
     change = f"error {before:.1f} N → {after:.1f} N {where}"
     if not diagnosis.bench.has_current:
         change += "; no motor current was recorded, so the stiffness path alone was diagnosed"
-    found = [_told(f) for f in diagnosis.accepted if not f.in_calibration and not f.made]
-    made = [_told(f) for f in diagnosis.accepted if f.made]
-    changed = [_told(f) for f in diagnosis.accepted if f.in_calibration]
+    found = [_told(diagnosis, f) for f in diagnosis.accepted if not f.in_calibration and not f.made]
+    made = [_told(diagnosis, f) for f in diagnosis.accepted if f.made]
+    changed = [_told(diagnosis, f) for f in diagnosis.accepted if f.in_calibration]
     sentences = [f"Found: {' and '.join(found)}"] if found else []
     if made:
         sentences.append(f"{'for' if found else 'Found for'} what no known effect explains: {' and '.join(made)}")

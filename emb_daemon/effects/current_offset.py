@@ -18,5 +18,8 @@ EFFECT = Effect(
     equation="I → I + I₀",
     source="Hall sensors: offset 0.5 to 1 % of range",
     signal="current",
-    manoeuvre="slow strokes both ways without load: an offset keeps its sign, friction changes it",
+    manoeuvre=(
+        "the current that is measured while the inverter is off is the offset; slow strokes both ways without load: it keeps "
+        "its sign, friction changes it"
+    ),
 )

@@ -22,5 +22,8 @@ EFFECT = Effect(
     equation="T_f → T_f (1 + a s)",
     source="forward and backward efficiency of screws: Olaru et al., Mech. Mach. Theory 2005",
     signal="motor_speed",
-    manoeuvre="slow strokes both ways over the whole force range",
+    manoeuvre=(
+        "slow strokes both ways over the whole force range, with a torque constant that is known otherwise (back-EMF): an "
+        "asymmetry grows with the force, an offset of the current does not"
+    ),
 )
