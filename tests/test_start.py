@@ -7,8 +7,9 @@ import pytest
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.step import step
-from emb_daemon.models.fusion import FAST, NOISE
+from emb_daemon.models.fusion import CONTACT, FAST, NOISE, SCALE
 from emb_daemon.models.stiffness import travel_at
+from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
 
@@ -280,6 +281,8 @@ def test_after_a_restart_pads_and_disc_have_cooled_for_as_long_as_they_rested(p,
     assert resumed["disc"] == pytest.approx(disc, abs=0.5) and resumed["mean"] == pytest.approx([pads, pads], abs=0.5)
     rise = 200.0 - p["thermal"]["reference"]
     assert resumed["history"] == pytest.approx(rise + (50.0 - rise) * np.exp(-elapsed_s / 100.0), abs=0.1)
+    softened = stiffness_factor(p["thermal"], pads - p["thermal"]["reference"], resumed["history"])
+    assert resumed["factor"] == pytest.approx(softened, abs=5e-4)
 
 
 def test_an_error_of_ten_sigma_is_no_brakes(p):
@@ -291,3 +294,56 @@ def test_an_error_of_ten_sigma_is_no_brakes(p):
     for sigmas, told in ((9.9, ""), (-10.1, "error")):
         snapshot["error"] = sigmas * sigma
         assert restart.why_implausible(snapshot, p) == told
+
+
+def _snapshot(p):
+    """SNAPSHOT of a brake that has just been switched on."""
+    s, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
+    step(s, p, _standing(p)[0][0], np.zeros(1, ESTIMATE)[0])
+    assert restart.take_snapshot(s, p, snapshot)
+    return snapshot
+
+
+@pytest.mark.parametrize(
+    ("name", "possible", "impossible"),
+    [
+        ("clearance_sigma", (0.0, 20.0), (-1e-6, 30.0)),
+        ("scale", (0.6, 1.6), (0.0, 9.0)),
+        ("growth", (0.06, -0.06), (0.07, -0.07)),
+        ("winding", (0.0, 4.0), (-0.01, 4.01)),
+        ("housing", (0.0, 4.0), (-0.01, 4.01)),
+        ("filtered", (0.0, 0.048), (-0.001, 0.05)),
+        ("pads", (-60.0, 1200.0), (-61.0, 1201.0)),
+        ("disc", (-60.0, 1200.0), (-61.0, 1201.0)),
+        ("growth_start", (-60.0, 1200.0), (-61.0, 1201.0)),
+        ("history", (-1200.0, 1200.0), (-1201.0, 1201.0)),
+        ("temperature_sigma", (0.0, 1200.0), (-0.1, 1201.0)),
+        ("history_sigma", (0.0, 1200.0), (-0.1, 1201.0)),
+    ],
+)
+def test_what_no_brake_can_be_is_named(p, name, possible, impossible):
+    """Contact within a millimetre of the calibration's, growth up to ten times that of an iron disc, temperatures that a pad
+    survives, heat and filters as large as they get."""
+    p["gear_gain"] = 4e-5
+    for values, told in ((possible, ""), (impossible, name)):
+        for value in values:
+            snapshot = _snapshot(p)
+            snapshot[name] = value
+            assert restart.why_implausible(snapshot, p) == told, value
+
+
+@pytest.mark.parametrize(("correlation", "told"), [(0.99, ""), (-1.0, ""), (1.1, "covariance"), (-1.5, "covariance")])
+def test_errors_that_are_correlated_by_more_than_all_are_no_brakes(p, correlation, told):
+    snapshot = _snapshot(p)
+    sigma = np.sqrt(np.diag(snapshot["covariance"]))
+    snapshot["covariance"] = np.diag(sigma**2)
+    snapshot["covariance"][CONTACT, SCALE] = snapshot["covariance"][SCALE, CONTACT] = (
+        correlation * sigma[CONTACT] * sigma[SCALE]
+    )
+    assert restart.why_implausible(snapshot, p) == told
+
+
+def test_temperatures_of_pads_that_were_never_known_may_be_anything(p):
+    snapshot = _snapshot(p)
+    snapshot["temperature_known"], snapshot["disc"] = False, 9e9
+    assert restart.why_implausible(snapshot, p) == ""
