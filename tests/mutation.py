@@ -29,17 +29,16 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 _SCOPE = (
-    "wire/*", "models/*", "runtime/*", "bounded", "estimator/common", "estimator/consistency", "estimator/heat",
-    "estimator/hypotheses", "estimator/monitor", "estimator/restart", "estimator/status", "estimator/step", "estimator/wheel",
-    "adapt/adaptation", "adapt/files", "adapt/learned", "adapt/memory", "adapt/snapshots", "adapt/training",
-    "diagnose/episodes", "diagnose/evidence",
+    "wire/*", "models/*", "estimator/*", "adapt/*", "runtime/*", "pipeline", "atomic", "bounded", "diagnose/episodes",
+    "diagnose/evidence",
 )  # fmt: skip
 #: Files whose tests are not all drives, which take minutes as plain Python.
 _TESTS = (
-    "adaptation", "alignment", "bus", "common", "consistency", "contact", "daemon", "diagnose_evidence", "faults_loop",
-    "friction", "gear", "heat", "hostile", "hypotheses", "kernels", "lateness", "monitor_bounds", "pages", "parameters",
-    "pipeline", "plausibility_kernels", "reload", "secoc", "snapshots", "start", "status", "step", "stiffness",
-    "training_rules", "wander", "wheel", "wire",
+    "adaptation", "alignment", "atomic", "bus", "common", "consistency", "contact", "daemon", "diagnose_evidence",
+    "faults_loop", "filter", "force_sensor", "friction", "gear", "heat", "hostile", "hypotheses", "kernels", "lateness",
+    "monitor_bounds", "pages", "parameters", "pipeline", "plausibility_kernels", "reload", "resolver", "rewind", "secoc",
+    "snapshots", "stale_angle", "start", "status", "step", "stiffness", "training_rules", "uneven", "wander", "wheel", "wire",
+    "xcp",
 )  # fmt: skip
 #: What takes longest to import and is the same in every process.
 _LIBRARIES = (
