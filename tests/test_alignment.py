@@ -397,3 +397,14 @@ def test_the_least_of_some_squares_lies_between_them():
     place = np.arange(7.0)
     assert alignment._least((place - 2.3) ** 2 + 0.7) == pytest.approx((2.3, 0.7))
     assert alignment._least(place + 1.0) == (0.0, 1.0)
+
+
+def test_where_the_motion_waits_for_its_current_the_force_is_that_of_now(parameters):
+    """Two cycles of a fast stroke would be hundreds of newtons."""
+    p = brake.ideal(parameters)
+    rows, force = brake.samples(p, brake.clamp(p, 14.0, 0.25))
+    rows["current_q"][2:] = rows["current_q"][:-2].copy()
+    state = new_state()
+    state["alignment"]["delay"] = 2.0
+    error = estimate(rows, p, state)["force"][-10:] - force[-10:]
+    assert np.abs(error).max() < 0.3 * (force[-1] - force[-3]) and force[-1] - force[-3] > 300.0

@@ -358,3 +358,19 @@ def test_a_bus_is_disturbed_for_a_second_by_lost_frames_and_error_frames_and_by_
     assert disturbed(5 * second)
     frames["flags"][1] = EXTENDED
     assert not disturbed(7 * second)
+
+
+def test_the_watchdog_is_pinged_while_every_corner_is_estimated_and_most_ticks_are_met(setup: Setup, caplog):
+    daemon = Daemon(setup, socket_pair()[0])
+
+    def pinged(met, missed, estimated=0b1111):
+        daemon.ticks, daemon.missed, daemon._estimated = daemon.ticks + met, daemon.missed + missed, estimated
+        return daemon._ping()
+
+    assert pinged(1, 1) and pinged(50, 50) and pinged(50, 49)
+    assert not pinged(20, 80) and "80 of 100 periods missed" in caplog.text
+    for corner, name in enumerate(CORNERS):
+        assert not pinged(100, 0, 0b1111 ^ 1 << corner) and f"corner {name}: no estimate" in caplog.text
+        daemon._lost = 1 << corner
+        assert not pinged(100, 0) and f"corner {name}: the estimator's state is not a number" in caplog.text
+        assert pinged(100, 0)

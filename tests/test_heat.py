@@ -246,3 +246,14 @@ def test_air_that_is_colder_than_the_disc_tells_of_heat_on_its_way_only_at_the_s
     s["ambient_heard"], s["resumed"], s["temperature_sigma"], m["cycle"] = False, resumed, 1.0, cycle
     heat(s, parameters[0], m)
     assert (s["temperature_sigma"] > 100.0) == wider and (s["history_sigma"] > 100.0) == wider
+
+
+def test_pads_of_different_warmth_are_as_soft_after_a_restart_as_their_mean(parameters):
+    thermal = parameters[0]["thermal"]
+    thermal["softening"], thermal["softening_history"] = 4e-4, 0.0
+    s, m = _warm(100.0, 200.0)
+    s["temperature_known"], s["rested_s"], s["pads"][1] = False, 0.004, 300.0
+    m["has_thermocouple"], m["inner_backplate"], m["outer_backplate"] = True, 100.0, 300.0
+    heat(s, parameters[0], m)
+    assert s["mean"] == pytest.approx([100.0, 300.0], abs=3.0)
+    assert s["factor"] == pytest.approx(1.0 - 4e-4 * (s["mean"].mean() - thermal["reference"]))

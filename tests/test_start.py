@@ -258,11 +258,12 @@ def test_after_a_restart_the_time_since_the_snapshot_tells_what_pads_may_remembe
     estimate(rows, p, state)
     assert restart.take_snapshot(state[0], p, snapshot)
     rested, sigmas = _standing(p)[0], {}
-    for elapsed_s in (10.0, 900.0):
+    for elapsed_s in (10.0, 11.0, 900.0):
         restarted = new_state()
         restart.resume(restarted[0], p, snapshot, elapsed_s)
         sigmas[elapsed_s] = estimate(rested, p, restarted)["sigma"][1]
     assert sigmas[10.0] > 1.3 * estimate(rested, p)["sigma"][1] and sigmas[900.0] < 1.1 * p["stiffness_sigma"]
+    assert sigmas[11.0] < 0.9 * sigmas[10.0], "a second later they have forgotten a third of it"
 
 
 @pytest.mark.parametrize(("elapsed_s", "disc", "pads"), [(0.1, 200.0, 197.3), (300.0, 141.0, 69.4)])
@@ -332,7 +333,9 @@ def test_what_no_brake_can_be_is_named(p, name, possible, impossible):
             assert restart.why_implausible(snapshot, p) == told, value
 
 
-@pytest.mark.parametrize(("correlation", "told"), [(0.99, ""), (-1.0, ""), (1.1, "covariance"), (-1.5, "covariance")])
+@pytest.mark.parametrize(
+    ("correlation", "told"), [(0.99, ""), (-1.0, ""), (1.1, "covariance"), (-1.5, "covariance"), (np.nan, "covariance")]
+)
 def test_errors_that_are_correlated_by_more_than_all_are_no_brakes(p, correlation, told):
     snapshot = _snapshot(p)
     sigma = np.sqrt(np.diag(snapshot["covariance"]))
