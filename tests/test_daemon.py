@@ -364,7 +364,8 @@ def test_the_watchdog_is_pinged_while_every_corner_is_estimated_and_most_ticks_a
     daemon = Daemon(setup, socket_pair()[0])
 
     def pinged(met, missed, estimated=0b1111):
-        daemon.ticks, daemon.missed, daemon._estimated = daemon.ticks + met, daemon.missed + missed, estimated
+        daemon.ticks, daemon.missed = daemon.ticks + met, daemon.missed + missed
+        daemon._estimated |= estimated
         return daemon._ping()
 
     assert pinged(1, 1) and pinged(50, 50) and pinged(50, 49)
