@@ -46,7 +46,7 @@ _LIBRARIES = (
     "yaml",
 )  # fmt: skip
 #: A test that takes longer as plain Python is left out, and all tests of one mutant take no longer, s of the processor.
-_TEST_S, _MUTANT_S = 1.5, 20.0
+_TEST_S, _MUTANT_S = 0.75, 20.0
 _SWAPPED = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
     ast.BitXor: ast.BitOr, ast.BitAnd: ast.BitOr, ast.LShift: ast.RShift, ast.RShift: ast.LShift,
@@ -85,16 +85,21 @@ class _Learned:
 
     def __init__(self, package: Path):
         self.result: dict[str, tuple[float, list[tuple[str, int]]]] = {}
-        self._package, self._called, self._failed = f"{package}/", set(), set()
+        self._package, self._called, self._failed, self._slow = f"{package}/", set(), set(), set()
 
     def _trace(self, frame, _event, _argument):
         code = frame.f_code
         if code.co_filename.startswith(self._package):
             self._called.add((code.co_filename[len(self._package) :], code.co_firstlineno))
 
+    def pytest_runtest_setup(self, item):
+        if item.nodeid.partition("[")[0] in self._slow:
+            pytest.skip("takes too long with other parameters")
+
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item):
         def too_long(*_):
+            self._slow.add(item.nodeid.partition("[")[0])
             pytest.skip("takes too long")
 
         self._called, begun = set(), time.process_time()
