@@ -1,12 +1,16 @@
-"""Parts of the fusion by hand: what a torque is made of, and how far it and the stiffness path may be off."""
+"""Parts of the estimator by hand: what a torque is made of, how far it and the stiffness path may be off, and what becomes of
+a zero that moves or strays."""
 
 import brake
 import numpy as np
 import pytest
 
-from emb_daemon.estimator import fuse, resolver
-from emb_daemon.estimator.records import SAMPLE, new_state
+from emb_daemon.estimator import fuse, resolver, straying
+from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
+from emb_daemon.estimator.step import step
+from emb_daemon.models.fusion import OF_THE_MODEL
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
+from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import CYCLE_S
 
 
@@ -100,3 +104,69 @@ def test_a_motor_is_at_rest_where_nobody_brakes_and_the_pads_are_apart(s, m, nam
     for past_contact in (-1.0, 0.5):
         s["past_contact"] = past_contact
         assert resolver.at_rest(s, m) == (rest and past_contact < 0.0)
+
+
+def test_the_share_of_what_strays_that_is_the_angles_is_learned_as_a_mean():
+    """By what moved of what strayed, each known with a variance, from nothing or all of it: a half as a standard deviation."""
+    a, rng = new_state()[0]["straying"], np.random.default_rng(4)
+    strayed, variance = rng.uniform(-0.5, 0.5, 6), rng.uniform(0.001, 0.01, 6)
+    moved, begun = 0.6 * strayed, float(a["share"])
+    for each in zip(strayed, moved, variance, strict=True):
+        straying._learn_share(a, *each)
+    told = np.sum(strayed**2 / variance)
+    assert a["share"] == pytest.approx((4.0 * begun + np.sum(strayed * moved / variance)) / (4.0 + told))
+    assert a["told"] == pytest.approx(told)
+    straying._learn_share(a, 0.1, 5.0, 1e-6)
+    assert a["share"] == 1.0
+    straying._learn_share(a, 0.1, -5.0, 1e-6)
+    assert a["share"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("rate", "drift", "moved"), [(0.0, 0.05, 0.5 * (0.05 * CYCLE_S + 0.01)), (0.3, 0.05, 0.3 * CYCLE_S + 0.5 * 0.01)]
+)
+def test_the_zero_follows_a_drift_that_is_certain_and_its_share_of_the_rest(p, s, rate, drift, moved):
+    """Counts that are lost, a hundredth of a rad here, have no rate."""
+    a, w = s["straying"], s["wander"]
+    a["rate"], a["share"], w["drift"], w["loss"] = rate, 0.5, drift, 0.01
+    before = float(s["contact_angle"])
+    straying.follow_straying(s, p, -1.0, -1.0, -250.0, False, CYCLE_S)
+    assert s["contact_angle"] - before == pytest.approx(moved)
+
+
+@pytest.mark.parametrize(
+    ("moved", "back", "returns"), [(0.5, -0.49, True), (0.5, -0.2, False), (0.1, -0.1, False), (0.5, 0.5, False)]
+)
+def test_a_zero_that_comes_back_has_never_moved(p, s, moved, back, returns):
+    """Within its standard deviations, three times; the contact is known as well as before then."""
+    s["away_s"], s["covariance"] = 1e9, 0.0
+    s["covariance"][fuse.CONTACT, fuse.CONTACT], s["gear_slope"] = 1e-4, 1.0
+    resolver._move_zero(s, p, moved, 0.05)
+    assert s["contact_angle"] == moved and s["covariance"][fuse.CONTACT, fuse.CONTACT] == pytest.approx(1e-4 + 0.05**2)
+    s["away_s"] = CYCLE_S
+    resolver._move_zero(s, p, back, 0.05)
+    if returns:
+        assert s["contact_angle"] == pytest.approx(0.0) and s["covariance"][fuse.CONTACT, fuse.CONTACT] == pytest.approx(1e-4)
+    else:
+        assert s["contact_angle"] == pytest.approx(moved + back)
+        assert s["covariance"][fuse.CONTACT, fuse.CONTACT] == pytest.approx(1e-4 + 2.0 * 0.05**2)
+
+
+def test_a_motor_whose_friction_is_unknown_says_as_little_of_the_force_as_that_friction_takes(p):
+    """It may have come from either side."""
+    rows, _ = brake.samples(p, np.concatenate([brake.clamp(p, 12.0, 0.2), np.full(3, p["clearance"] + 12.0)]))
+    state, out = new_state(), np.zeros(1, ESTIMATE)[0]
+    estimate(rows, p, state)
+    state["friction_variance"] = 1.0
+    step(state[0], p, rows[-1], out)
+    friction = p["offset_friction"] + p["load_friction"] * out["stiffness_force"]
+    open_N = friction / (p["gear_gain"] + p["load_friction"] * state["friction_mean"][0])
+    assert out["stiffness_force"] > 4000.0 and open_N < out["torque_sigma"] < 1.2 * open_N
+
+
+def test_a_brake_that_is_held_as_known_stays_so(p):
+    """As a diagnosis holds it: nothing of its pads, contact and growth walks."""
+    p["clearance_sigma"] = 0.0
+    state = new_state()
+    estimate(brake.samples(p, brake.clamp(p, 3.0, 0.05))[0], p, state)
+    assert not np.diag(state["covariance"][0])[[*OF_THE_MODEL]].any()

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import restart
+from emb_daemon.estimator.contact import seek_release
 from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.step import step
-from emb_daemon.models.fusion import CONTACT, FAST, NOISE, SCALE
+from emb_daemon.models.fusion import CONTACT, FAST, NOISE, OFFSET, SCALE
 from emb_daemon.models.stiffness import travel_at
 from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline import estimate
@@ -350,3 +351,62 @@ def test_temperatures_of_pads_that_were_never_known_may_be_anything(p):
     snapshot = _snapshot(p)
     snapshot["temperature_known"], snapshot["disc"] = False, 9e9
     assert restart.why_implausible(snapshot, p) == ""
+
+
+# The search alone.
+
+
+@pytest.fixture
+def unknown(p):
+    """STATE of a brake that started clamped, and a SAMPLE of its motor, which stands; nobody brakes."""
+    s, m = new_state()[0], _standing(p)[0][1]
+    step(s, p, m, np.zeros(1, ESTIMATE)[0])
+    s["seen"], s["unknown"], s["since_start_s"] = True, True, 1.0
+    return s, m
+
+
+def _known_after(s, p, m, seconds):
+    """Time (s) after which the contact is known, infinite if it is not within ``seconds``."""
+    for number in range(round(seconds / 0.004)):
+        seek_release(s, p, m)
+        if not s["unknown"]:
+            return 0.004 * (number + 1)
+    return np.inf
+
+
+@pytest.mark.parametrize(("share", "after_s"), [(0.0, 0.1), (0.025, 0.1), (-0.025, 0.1), (0.035, 1.0), (-0.2, 1.0)])
+def test_a_motor_that_stands_released_is_known_in_a_tenth_of_a_second_without_torque_and_in_one_with(
+    p, unknown, share, after_s
+):
+    """Beyond friction, 3 % of what the largest force needs are an ordinary sensor's offset; what is more is one, too, if it
+    lasts, and is known to be one from then on."""
+    s, m = unknown
+    torque = share * p["gear_gain"] * p["maximum_force"] + np.sign(share) * p["offset_friction"]
+    s["plausibility"]["torque_mean"], m["angle"] = torque, s["angle"]
+    offset = float(s["error"][OFFSET])
+    assert _known_after(s, p, m, 2.0) == pytest.approx(after_s, abs=0.005)
+    assert s["contact_angle"] == pytest.approx(m["angle"] + p["clearance"])
+    assert s["error"][OFFSET] - offset == pytest.approx(torque if after_s == 1.0 else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("park_brake", 1.0), ("brake_request", 1.0), ("has_status", False), ("angle", None)]
+)
+def test_where_somebody_may_brake_or_the_motor_moves_nothing_is_known(p, unknown, name, value):
+    s, m = unknown
+    m[name] = s["angle"] + 0.01 if value is None else value
+    assert _known_after(s, p, m, 3.0) == np.inf
+
+
+@pytest.mark.parametrize(("share", "torque_share", "known"), [(0.5, 0.0, True), (0.25, 0.0, False), (0.5, 0.03, False)])
+def test_who_closes_through_a_third_of_the_clearance_without_any_force_was_released(p, unknown, share, torque_share, known):
+    s, m = unknown
+    m["brake_request"], s["start_angle"], s["friction_mean"] = 1.0, s["angle"], 1.0
+    s["balance"] = torque_share * p["gear_gain"] * p["maximum_force"]
+    begun = float(s["start_angle"])
+    for angle in begun + np.linspace(0.0, share * p["clearance"], 100):
+        m["angle"] = angle
+        seek_release(s, p, m)
+    assert s["unknown"] != known
+    if known:
+        assert s["contact_angle"] == pytest.approx(begun + p["clearance"])
