@@ -37,8 +37,8 @@ _TESTS = (
     "adaptation", "alignment", "atomic", "bus", "common", "consistency", "contact", "daemon", "diagnose_evidence",
     "faults_loop", "filter", "force_sensor", "friction", "fuse", "gear", "heat", "hostile", "hypotheses", "kernels",
     "lateness", "monitor_bounds", "pages", "parameters", "pipeline", "plausibility_kernels", "reload", "resolver", "rewind",
-    "secoc", "snapshots", "stale_angle", "start", "status", "step", "stiffness", "training_rules", "uneven", "unknown",
-    "wander", "wheel", "wire", "xcp",
+    "secoc", "snapshots", "stale_angle", "start", "status", "step", "stiffness", "training_fit", "training_rules", "uneven",
+    "unknown", "wander", "wheel", "wire", "xcp",
 )  # fmt: skip
 #: What takes longest to import and is the same in every process.
 _LIBRARIES = (
