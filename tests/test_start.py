@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import restart
-from emb_daemon.estimator.contact import seek_release
+from emb_daemon.estimator.contact import _start_clamped, seek_release
 from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, OFFSET, SCALE
-from emb_daemon.models.stiffness import travel_at
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
@@ -410,3 +410,21 @@ def test_who_closes_through_a_third_of_the_clearance_without_any_force_was_relea
     assert s["unknown"] != known
     if known:
         assert s["contact_angle"] == pytest.approx(begun + p["clearance"])
+
+
+def test_a_torque_at_power_on_may_be_a_clamped_brake_or_an_offset_of_as_much(p, unknown):
+    """The force is what the torque says; contact and offset are wrong together, or neither is."""
+    s, m = unknown
+    leverage, torque = p["gear_gain"] + p["load_friction"], 0.3
+    before = float(s["covariance"][OFFSET, OFFSET])
+    _start_clamped(s, p, m, torque, 0.01, leverage)
+    P, (force, slope) = s["covariance"], characteristic_curve(s["past_contact"], p["curve"])
+    assert s["force"] == pytest.approx(torque / leverage, rel=1e-3) == pytest.approx(s["factor"] * force, rel=1e-3)
+    assert s["contact_angle"] + s["past_contact"] == pytest.approx(s["angle"])
+    assert P[OFFSET, OFFSET] == pytest.approx(before + torque**2)
+    assert (
+        P[CONTACT, OFFSET]
+        == P[OFFSET, CONTACT]
+        == pytest.approx(P[OFFSET, OFFSET] / (leverage * s["factor"] * slope), rel=1e-3)
+    )
+    assert P[CONTACT, CONTACT] * P[OFFSET, OFFSET] >= P[CONTACT, OFFSET] ** 2
