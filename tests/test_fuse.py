@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import fuse, resolver, straying
+from emb_daemon.estimator.paths import FLICKER_RAD, torque_path
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.models.fusion import OF_THE_MODEL
+from emb_daemon.models.lateness import remember
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import CYCLE_S
@@ -92,6 +94,16 @@ def test_what_holds_a_standing_motor_is_as_unsure_as_its_friction(p, s, m):
     for has_speed, speed, swings in ((False, 0.0, True), (True, 0.0, False), (True, 2.0 * TURNING_RAD_PER_S, True)):
         m["has_wheel_speed"], m["wheel_speed"] = has_speed, speed
         assert (fuse._standing_sigmas(s, p, m)[1] > 0.0) == swings
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.008])
+def test_what_is_kept_of_friction_follows_the_angle_alone_however_late_that_is(p, s, m, late_s):
+    for _ in range(5):
+        remember(s["lately"], 40.0, CYCLE_S)
+    s["late"], s["past_contact"], m["angle"] = late_s, -5.0, 0.16
+    torque_path(s, p, m)
+    assert s["slid_angle"] == pytest.approx(0.16, abs=FLICKER_RAD)
+    assert s["friction_state"] == pytest.approx(1.0 - np.exp(-s["slid_angle"] / p["presliding_angle"]))
 
 
 @pytest.mark.parametrize(

@@ -193,10 +193,10 @@ def test_a_sum_of_correlated_noise_wanders_as_much_further_as_the_threshold_is_h
     assert contact.threshold(share, 0.02, 0.004) == pytest.approx(further * contact.threshold(0.0, 0.02, 0.004))
 
 
-def _closing(c, torque, predicted, samples, x=2.0):
+def _closing(c, torque, predicted, samples, x=2.0, offset=0.0):
     """What `watch_closing` finds in the last of some samples; noise of 0.01 N m, contact known to 0.02 rad, threshold 8."""
     for _ in range(samples):
-        found = contact.watch_closing(c[0], torque, predicted, 1.0, 0.01, 8.0, x, 0.02, 0.0, 0.001, True)
+        found = contact.watch_closing(c[0], torque, predicted, 1.0, 0.01, 8.0, x, 0.02, offset, 0.001, True)
     return found
 
 
@@ -216,16 +216,21 @@ def test_a_contact_angle_is_confirmed_by_a_hundred_samples_of_the_torque_that_it
     assert doubted["shortfall"][0] == pytest.approx(5.0) and not doubted["confirmed"][0]
 
 
+@pytest.mark.parametrize("level", [0.0, 0.5, -0.5])
 @pytest.mark.parametrize(("first", "found"), [(0.0, contact.TOO_LATE), (0.004, contact.TOO_LATE), (0.04, contact.NOTHING)])
-def test_torque_in_the_clearance_is_an_offset_if_it_was_there_from_the_strokes_first_sample_and_else_a_force(first, found):
-    """A force that grows after thirty samples without any, or with a little, is one; what was there at once is an offset."""
+def test_torque_over_the_clearances_is_an_offset_if_it_was_there_from_a_strokes_first_sample_and_else_a_force(
+    first, found, level
+):
+    """A force that grows after thirty samples without any, or with a little, is one; what was there at once is an offset. What
+    the clearance had before is neither."""
     c = np.zeros(1, contact.CONTACT)
-    _closing(c, 0.0, 0.0, 200, x=-5.0)
-    contact.watch_closing(c[0], 0.0, 0.0, -1.0, 0.01, 8.0, -5.0, 0.02, 0.0, 0.001, True)
-    said = [_closing(c, first, 0.0, 1, x=-5.0) for _ in range(8)]
-    said += [_closing(c, first + max(0.01 * number - 0.3, 0.0) * (first < 0.04), 0.0, 1, x=-5.0) for number in range(60)]
+    _closing(c, level, 0.0, 200, x=-5.0, offset=level)
+    contact.watch_closing(c[0], level, 0.0, -1.0, 0.01, 8.0, -5.0, 0.02, 0.0, 0.001, True)
+    said = [_closing(c, level + first, 0.0, 1, x=-5.0) for _ in range(8)]
+    grown = np.maximum(0.01 * np.arange(60) - 0.3, 0.0) * (first < 0.04)
+    said += [_closing(c, level + first + more, 0.0, 1, x=-5.0) for more in grown]
     assert (contact.TOO_LATE in said) == (found == contact.TOO_LATE)
-    assert c["samples"][0] < 100.0 if found == contact.NOTHING else c["engaged"][0]
+    assert said.index(contact.TOO_LATE) > 30 if found == contact.TOO_LATE else c["samples"][0] < 100.0
 
 
 def test_another_contact_angle_is_watched_anew():

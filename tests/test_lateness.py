@@ -26,7 +26,7 @@ from emb_daemon.models.lateness import (
     unfilter,
     way_beside,
 )
-from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
+from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, UNDECIDED
 from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import OUT_OF_RANGE, PATHS_DISAGREE
@@ -383,6 +383,13 @@ def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
     followed = what == "nothing"
     assert (s["lateness"]["gained"] != 0.0) == (s["lateness"]["apart"] != 0.0) == followed
     assert (s["lateness"]["sums"][0] != before["sums"][0]) == followed
+
+
+@pytest.mark.parametrize(("verdict", "followed"), [(AGREE, True), (UNDECIDED, True), (STIFFNESS_WRONG, False)])
+def test_a_resolver_that_is_not_believed_tells_of_no_drift(parameters, s, verdict, followed):
+    s["plausibility"]["verdict"] = verdict
+    step._follow_age(s, parameters[0], _turning(parameters[0]), _TURNED, False)
+    assert (s["wander"]["seconds"] == _DT) == (s["wander"]["slip"] != 0.0) == followed
 
 
 @pytest.mark.parametrize(("known_s", "left_s"), [(0.0, 0.007), (0.004, 0.003), (0.007, 0.0), (0.009, 0.0)])
