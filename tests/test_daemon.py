@@ -375,3 +375,12 @@ def test_the_watchdog_is_pinged_while_every_corner_is_estimated_and_most_ticks_a
         daemon._lost = 1 << corner
         assert not pinged(100, 0) and f"corner {name}: the estimator's state is not a number" in caplog.text
         assert pinged(100, 0)
+
+
+def test_a_service_managers_socket_may_have_a_name_of_the_kernels():
+    """That begins with @ in the environment, and with a zero byte for the kernel (unix(7))."""
+    name = f"emb-daemon-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(f"\0{name}")
+        ServiceManager({"NOTIFY_SOCKET": f"@{name}"}).notify("READY=1", "STATUS=here")
+        assert manager.recv(4096) == b"READY=1\nSTATUS=here"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import fuse, resolver, straying
+from emb_daemon.estimator.hypotheses import TORQUE_JUMP
 from emb_daemon.estimator.paths import FLICKER_RAD, torque_path
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import step
@@ -174,6 +175,47 @@ def test_a_motor_whose_friction_is_unknown_says_as_little_of_the_force_as_that_f
     friction = p["offset_friction"] + p["load_friction"] * out["stiffness_force"]
     open_N = friction / (p["gear_gain"] + p["load_friction"] * state["friction_mean"][0])
     assert out["stiffness_force"] > 4000.0 and open_N < out["torque_sigma"] < 1.2 * open_N
+
+
+def test_friction_is_known_once_the_motor_has_slid_and_not_where_its_angle_creeps_without_speed(p, s, m):
+    """In the clearance, where nothing but the motor turns the gear."""
+    for creeps in (False, True):
+        s["straying"]["creeps"], s["past_contact"], s["friction_variance"], s["friction_state"] = creeps, -5.0, 1.0, -1.0
+        for _ in range(6):
+            m["angle"] += p["presliding_angle"]
+            torque_path(s, p, m)
+        assert (s["friction_variance"] < 1e-3) != creeps
+
+
+@pytest.fixture(scope="module")
+def closed(shipped_setup):
+    """PARAMETERS, STATE at the end of a quick clamp to 12 rad past contact, and the next SAMPLE."""
+    p = brake.ideal(shipped_setup.parameters)
+    rows, _ = brake.samples(p, brake.clamp(p, 12.0, 0.2))
+    state = new_state()
+    estimate(rows[:-1], p, state)
+    return p, state, rows[-1]
+
+
+def test_what_is_left_unexplained_is_what_the_best_change_leaves(closed):
+    """A current that is 2 A too high is no news to a torque path whose offset has jumped by as much."""
+    p, out, left = closed[0], np.zeros(1, ESTIMATE)[0], []
+    for learned_A in (0.0, 2.0):
+        state, m = closed[1].copy(), closed[2].copy()
+        m["current_q"] += 2.0
+        state["alternatives"]["error"][0, TORQUE_JUMP, fuse.OFFSET] += learned_A * p["torque_constant"]
+        step(state[0], p, m, out)
+        left.append(abs(out["innovation"]) / out["innovation_sigma"])
+    assert left[1] < 0.3 * left[0]
+
+
+def test_friction_beside_the_motion_that_a_current_is_held_against_is_without_inertia(p):
+    """Of a motor that gains speed in the clearance."""
+    path = 0.5 * 900.0 * (CYCLE_S * np.arange(25)) ** 2
+    state = new_state()
+    estimate(brake.samples(p, np.concatenate([np.zeros(5), path]))[0], p, state)
+    assert state["alignment"]["friction"][0, 2] == pytest.approx(p["offset_friction"], rel=0.1)
+    assert state["alignment"]["by_motion"][0, 2] == pytest.approx(p["offset_friction"] + 900.0 * p["inertia"], rel=0.1)
 
 
 def test_a_brake_that_is_held_as_known_stays_so(p):

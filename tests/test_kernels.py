@@ -139,6 +139,9 @@ def test_profile_of_a_pad(thermal):
     for share in (0.0, 0.2, 0.77, 1.0):
         assert at_depth(profile, positions, share * thickness) == pytest.approx(500.0 - 400.0 * share)
     assert np.isnan(at_depth(profile, positions, 1.01 * thickness))
+    steep = 400.0 * np.exp(-8.0 * positions / thickness)
+    for share in (0.05, 0.31, 0.64, 0.98):
+        assert at_depth(steep, positions, share * thickness) == pytest.approx(400.0 * np.exp(-8.0 * share), abs=2.0)
 
 
 def test_stiffness_factor(thermal):

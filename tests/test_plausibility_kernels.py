@@ -344,3 +344,11 @@ def test_a_torque_that_does_not_swing_has_turned_no_motor(torque):
 def test_a_motor_without_torque_beyond_friction_is_never_due():
     c = np.zeros(1, PLAUSIBILITY)[0]
     assert not any(stands(c, 0.0) and due(c, 0.0, 0.0, _DT) for _ in range(1000))
+
+
+@pytest.mark.parametrize("limit", [0.4, 12.0])
+def test_a_current_at_its_sensors_limit_is_frozen_whatever_that_is(limit):
+    w = Watched()
+    w.c["limit"] = w.c["largest"] = limit
+    assert w.pass_by(1, speed=50.0, current=-limit) == TORQUE_FROZEN
+    assert w.pass_by(1, speed=50.0, current=0.9 * limit) == AGREE
