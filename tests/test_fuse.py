@@ -5,6 +5,7 @@ import brake
 import numpy as np
 import pytest
 
+from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator import fuse, resolver, straying
 from emb_daemon.estimator.hypotheses import TORQUE_JUMP
 from emb_daemon.estimator.paths import FLICKER_RAD, torque_path
@@ -207,6 +208,26 @@ def test_what_is_left_unexplained_is_what_the_best_change_leaves(closed):
         step(state[0], p, m, out)
         left.append(abs(out["innovation"]) / out["innovation_sigma"])
     assert left[1] < 0.3 * left[0]
+
+
+def test_counts_that_a_stroke_may_lose_leave_open_as_much_force_as_the_gear_makes_of_them(shipped_setup):
+    """A hundredth of what the motor turns in a stroke of a quarter of a second, by the slopes of gear and pads; on a ramp, too."""
+    from test_gear import ramp
+
+    calibration = shipped_setup.calibrations["FL"]
+    for p in (to_parameters(calibration), to_parameters(ramp(calibration))):
+        rows, _ = brake.samples(p, np.linspace(0.0, p["clearance"] + 12.0, 45))
+        state, out, sigma = new_state(), np.zeros(1, ESTIMATE)[0], []
+        estimate(rows[:-1], p, state)
+        for loss in (0.0, 0.01):
+            after = state.copy()
+            after["wander"]["loss"] = loss
+            step(after[0], p, rows[-1], out)
+            sigma.append(float(out["sigma"]))
+        s = after[0]
+        opened = 0.01 * fuse._STROKE_S * p["maximum_speed"] * s["slope"] * s["gear_slope"]
+        assert sigma[1] ** 2 - sigma[0] ** 2 == pytest.approx(opened**2, rel=0.02)
+    assert abs(s["gear_slope"] - 1.0) > 0.05
 
 
 def test_friction_beside_the_motion_that_a_current_is_held_against_is_without_inertia(p):
