@@ -211,7 +211,7 @@ def test_what_is_left_unexplained_is_what_the_best_change_leaves(closed):
 
 
 def test_counts_that_a_stroke_may_lose_leave_open_as_much_force_as_the_gear_makes_of_them(shipped_setup):
-    """A hundredth of what the motor turns in a stroke of a quarter of a second, by the slopes of gear and pads; on a ramp, too."""
+    """A hundredth of what a stroke of 0.25 s turns the motor by, times the slopes of gear and pads; on a ramp, too."""
     from test_gear import ramp
 
     calibration = shipped_setup.calibrations["FL"]
