@@ -8,7 +8,7 @@ import pytest
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.estimator import fuse, resolver, straying
 from emb_daemon.estimator.hypotheses import TORQUE_JUMP
-from emb_daemon.estimator.paths import FLICKER_RAD, torque_path
+from emb_daemon.estimator.paths import FLICKER_RAD, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import step
 from emb_daemon.models.fusion import OF_THE_MODEL
@@ -96,6 +96,20 @@ def test_what_holds_a_standing_motor_is_as_unsure_as_its_friction(p, s, m):
     for has_speed, speed, swings in ((False, 0.0, True), (True, 0.0, False), (True, 2.0 * TURNING_RAD_PER_S, True)):
         m["has_wheel_speed"], m["wheel_speed"] = has_speed, speed
         assert (fuse._standing_sigmas(s, p, m)[1] > 0.0) == swings
+
+
+def test_pads_that_stand_keep_the_force_that_their_way_there_has_left_them(parameters, s, m):
+    """Of pads with hysteresis alone: one that has been released by a radian has less force than one that closes, for good."""
+    p = brake.ideal(parameters)
+    p["effects"]["stiffness_hysteresis"] = parameters[0]["effects"]["stiffness_hysteresis"]
+    s["contact_angle"], s["force"], s["past_contact"], forces = 5.0, 0.0, -5.0, []
+    for way, count in (([0.0, 17.0], 150), ([17.0, 18.0], 10), ([18.0, 17.0], 10), ([17.0, 17.0], 300)):
+        for m["angle"] in np.linspace(*way, count):
+            stiffness_path(s, p, m, 1.0)
+            s["angle"] = m["angle"]
+        forces.append(float(s["drive"]))
+    closing, _, released, stands = forces
+    assert released < 0.99 * closing and stands == pytest.approx(released, rel=1e-6)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.008])
