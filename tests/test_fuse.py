@@ -250,6 +250,8 @@ def test_friction_beside_the_motion_that_a_current_is_held_against_is_without_in
     state = new_state()
     estimate(brake.samples(p, np.concatenate([np.zeros(5), path]))[0], p, state)
     assert state["alignment"]["friction"][0, 2] == pytest.approx(p["offset_friction"], rel=0.1)
+    # Smoothed over 40 ms for the watch on a standing angle: there is none of the inertia's in it, either.
+    assert 0.7 * p["offset_friction"] < state["plausibility"]["steady"][0] < 1.1 * p["offset_friction"]
     assert state["alignment"]["by_motion"][0, 2] == pytest.approx(p["offset_friction"] + 900.0 * p["inertia"], rel=0.1)
 
 

@@ -2,6 +2,7 @@
 
 import re
 
+import cantools
 import numpy as np
 import pytest
 import wirekit
@@ -163,6 +164,20 @@ def test_one_count_beyond_its_range_a_number_is_refused():
                 assert _receive(sent, new_reception())[1] == BAD_RANGE, signal.name
                 tried += 1
     assert tried
+
+
+_WITHOUT_RANGES = """VERSION ""
+BU_: X
+BO_ 256 M: 8 X
+ SG_ Unsigned : 16|12@1+ (0.5,-10) [0|0] "" X
+ SG_ Signed : 32|12@1- (0.5,-10) [0|0] "" X
+"""
+
+
+@pytest.mark.parametrize(("name", "low", "high"), [("Unsigned", 0, 4095), ("Signed", -2048, 2047)])
+def test_a_signal_without_a_stated_range_has_that_of_its_bits(name, low, high):
+    signal = wire.signal_columns(cantools.database.load_string(_WITHOUT_RANGES, "dbc"), "M", (name,))[0]
+    assert (signal["low"], signal["high"]) == (0.5 * low - 10.0, 0.5 * high - 10.0)
 
 
 @given(st.sampled_from(_NAMES), st.sampled_from([np.inf, -np.inf, np.nan, 1e300, -1e300]))
