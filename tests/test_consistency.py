@@ -7,6 +7,7 @@ from emb_daemon.estimator.consistency import (
     CONSISTENCY,
     CONSISTENT,
     HORIZONS,
+    HORIZONS_S,
     INCONSISTENT,
     UNKNOWN,
     forget,
@@ -92,3 +93,15 @@ def test_what_has_been_explained_is_not_remembered():
     forget(watched.c[0])
     verdicts, errors = watched.pass_by(120.0)
     assert not np.any(verdicts == INCONSISTENT) and not np.any(errors)
+
+
+def test_what_is_left_is_held_against_what_noise_of_its_sigma_would_leave():
+    """A first-order mean of white noise has the share s / (2 - s) of its variance; of a bias its square counts, up to sixteen
+    times that."""
+    c, dt, bias = np.zeros(1, CONSISTENCY), 0.02, 0.4
+    for _ in range(3000):
+        remember(c[0], bias * _SIGMA, _SIGMA, dt)
+    share = 1.0 - np.exp(-dt / np.array(HORIZONS_S))
+    noise = share / (2.0 - share)
+    assert c["expected"][0] == pytest.approx(_SIGMA**2 * noise, rel=0.05)
+    assert c["square"][0] == pytest.approx(_SIGMA**2 * np.minimum(bias**2, 16.0 * noise), rel=0.1)

@@ -20,12 +20,13 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, commands_of
-from emb_daemon.runtime.daemon import Daemon, Pacer
+from emb_daemon.runtime.daemon import Daemon, Pacer, _scan
 from emb_daemon.runtime.rawcan import socket_pair
 from emb_daemon.runtime.systemd import ServiceManager
 from emb_daemon.wire import contract
 from emb_daemon.wire.contract import CYCLE_NS
-from emb_daemon.wire.frames import FRAME
+from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME
+from emb_daemon.wire.layout import CORNER_MESSAGES, CORNERS, CURRENT, RESOLVER
 
 CONFIG = Path(__file__).parent.parent / "config"
 CLAMP_FORCE_FL = 0x200
@@ -317,3 +318,69 @@ def test_each_whole_period_that_a_tick_is_late_is_a_missed_one(setup: Setup, lat
     daemon, pacer = Daemon(setup, socket_pair()[0]), Pacer(0)
     daemon._count(pacer.last_tick_ns + round((1.0 + late) * CYCLE_NS), pacer)
     assert (daemon.ticks, daemon.missed) == (1, missed)
+
+
+@pytest.mark.parametrize(("pid", "timeout"), [(None, 3.0), (os.getpid(), 3.0), (1, None)])
+def test_a_watchdog_is_ours_unless_it_is_another_process_s(pid, timeout):
+    environment = {"WATCHDOG_USEC": "3000000"} | ({} if pid is None else {"WATCHDOG_PID": str(pid)})
+    assert ServiceManager(environment).watchdog_s == timeout and ServiceManager({}).watchdog_s is None
+
+
+def test_a_scan_tells_who_was_estimated_when_from_what_and_whose_state_is_no_number():
+    """Of RL's and FR's sample and RR's prediction; a sample is complete with its later message."""
+    pipeline = Pipeline(Setup(CONFIG / "emb.yaml").parameters, CORNERS)
+    rows, states, times = pipeline.estimates[:3], pipeline.states, pipeline.receptions
+    rows["corner"], rows["is_sample"], rows["mode"] = (2, 1, 3), (True, True, False), contract.RUNNING
+    rows["reasons"], rows["facts"] = (0, contract.BUS_DISTURBED, contract.STUCK), (1, 2, 4)
+    times["time_ns"] = np.arange(len(times)) * 1000
+    times["time_ns"][CORNER_MESSAGES * 2 + CURRENT] = 900_000
+    arrivals, reported, facts = np.full(4, 7), np.full(4, contract.RUNNING << 16), np.zeros(4, np.int64)
+    assert _scan(rows, 3, states, times, arrivals, reported, facts) == (0b1110, 0, 0b1000)
+    assert arrivals.tolist() == [0, 1000 * (CORNER_MESSAGES + max(RESOLVER, CURRENT)), 900_000, 0]
+    assert facts.tolist() == [0, 2, 1, 4] and reported[3] == contract.RUNNING << 16 | contract.STUCK
+    rows["source"] = contract.INVALID
+    states[1]["alternatives"]["covariance"][2, 3, 3], states[2]["error"][4] = np.nan, np.inf
+    assert _scan(rows, 3, states, times, arrivals, reported, facts) == (0b1110, 0b0110, 0)
+
+
+def test_a_bus_is_disturbed_for_a_second_by_lost_frames_and_error_frames_and_by_nothing_else(setup: Setup):
+    daemon, frames, second = Daemon(setup, socket_pair()[0]), np.zeros(3, FRAME), 1_000_000_000
+    frames["length"] = 8
+
+    def disturbed(now_ns):
+        daemon._watch_bus(frames, now_ns)
+        return daemon.pipeline.disturbed.any()
+
+    assert not disturbed(second)
+    daemon._bus.dropped += 1
+    assert disturbed(2 * second) and disturbed(3 * second - 1) and not disturbed(3 * second)
+    frames["flags"][1] = ERROR
+    assert disturbed(5 * second)
+    frames["flags"][1] = EXTENDED
+    assert not disturbed(7 * second)
+
+
+def test_the_watchdog_is_pinged_while_every_corner_is_estimated_and_most_ticks_are_met(setup: Setup, caplog):
+    daemon = Daemon(setup, socket_pair()[0])
+
+    def pinged(met, missed, estimated=0b1111):
+        daemon.ticks, daemon.missed = daemon.ticks + met, daemon.missed + missed
+        daemon._estimated |= estimated
+        return daemon._ping()
+
+    assert pinged(1, 1) and pinged(50, 50) and pinged(50, 49)
+    assert not pinged(20, 80) and "80 of 100 periods missed" in caplog.text
+    for corner, name in enumerate(CORNERS):
+        assert not pinged(100, 0, 0b1111 ^ 1 << corner) and f"corner {name}: no estimate" in caplog.text
+        daemon._lost = 1 << corner
+        assert not pinged(100, 0) and f"corner {name}: the estimator's state is not a number" in caplog.text
+        assert pinged(100, 0)
+
+
+def test_a_service_managers_socket_may_have_a_name_of_the_kernels():
+    """That begins with @ in the environment, and with a zero byte for the kernel (unix(7))."""
+    name = f"emb-daemon-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(f"\0{name}")
+        ServiceManager({"NOTIFY_SOCKET": f"@{name}"}).notify("READY=1", "STATUS=here")
+        assert manager.recv(4096) == b"READY=1\nSTATUS=here"

@@ -219,6 +219,7 @@ def test_a_short_log_is_cut_into_forty_pieces_and_no_shorter_than_half_a_second(
         time = np.arange(0.0, seconds, 0.01)
         number = episodes(time, np.full(len(time), 3000.0), np.cumsum(np.ones(len(time))))
         assert number[-1] + 1 == pytest.approx(pieces, abs=1)
+        assert np.bincount(number)[:-1] == pytest.approx(100.0 * seconds / pieces, abs=2)
     time = np.arange(0.0, 400.0, 0.01)
     number = episodes(time, np.where(time % 5.0 > 2.0, 5000.0, 0.0), np.cumsum(np.ones(len(time))))
     assert number[-1] + 1 == 80 and np.all(np.bincount(number) == 500)
@@ -341,6 +342,17 @@ def test_a_load_turns_friction_back_however_short_the_stop(way):
     stands = (time >= 1.0) & (time < 1.1)
     angle = way * 20.0 * np.where(time < 1.0, time, np.maximum(time - 0.1, 1.0))
     swing = 900.0 * way * np.clip((time - 1.0) / 0.1, 0.0, 1.0)
-    found = yielding(angle, 8000.0 + swing, np.full(len(time), way), np.full(len(time), 300.0))
+    found = yielding(angle, 8000.0 + swing, np.full(len(time), 0.6 * way), np.full(len(time), 300.0))
     assert found[stands & (time > 1.06)].all() and not found[time < 1.02].any() and not found[time > 1.102].any()
-    assert not yielding(angle, 8000.0 - swing, np.full(len(time), way), np.full(len(time), 300.0)).any()
+    assert not yielding(angle, 8000.0 - swing, np.full(len(time), 0.6 * way), np.full(len(time), 300.0)).any()
+
+
+def test_moments_are_those_of_each_episodes_samples():
+    """One without samples has none."""
+    rng, lengths = np.random.default_rng(5), [3, 0, 5, 1]
+    regressors, residual, episode = rng.standard_normal((9, 2)), rng.standard_normal(9), np.repeat(np.arange(4), lengths)
+    moments = Moments.of(regressors, residual, episode, 4)
+    table = np.column_stack([regressors, residual])
+    assert moments.counts.tolist() == lengths and moments.products.shape == (4, 3, 3)
+    for number, products in enumerate(moments.products):
+        np.testing.assert_allclose(products, table[episode == number].T @ table[episode == number])

@@ -1,6 +1,7 @@
 """Faults of bus, machine and clock around a daemon whose ticks the test makes: which flag rises, for how long, and what the
 estimate does meanwhile."""
 
+import ctypes
 import errno
 import logging
 import os
@@ -8,6 +9,7 @@ import socket
 import struct
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import adaptkit
 import numpy as np
@@ -27,7 +29,7 @@ from emb_daemon.runtime.daemon import Daemon, Pacer
 from emb_daemon.runtime.rawcan import RawCanSocket, socket_pair
 from emb_daemon.wire import contract as r
 from emb_daemon.wire.contract import CYCLE_NS
-from emb_daemon.wire.frames import ERROR, FRAME
+from emb_daemon.wire.frames import ERROR, EXTENDED, FRAME, REMOTE
 
 CONFIG = Path(__file__).parent.parent / "config" / "emb.yaml"
 _SHOWN_CYCLES = 250
@@ -489,3 +491,36 @@ def test_swapped_messages_of_a_pair_are_one_sample(car):  # noqa: F811
     straight, _ = _run(car, np.concatenate(_sliding(300)))
     assert len(estimates) == 300 and not estimates["reasons"].any()
     np.testing.assert_array_equal(estimates["force"], straight["force"])
+
+
+@pytest.mark.parametrize(("bits", "flags"), [(0, 0), (0x8000_0000, EXTENDED), (0x4000_0000, REMOTE), (0x2000_0000, ERROR)])
+def test_what_kind_a_frame_is_the_bits_beside_its_id_tell(bits, flags):
+    """Of linux/can.h."""
+    near, far = socket_pair()
+    near._received.raw["can_id"][0], near._received.headers["length"][0] = bits | 0x123, 16
+    near._received.headers["control_length"][0] = 0
+    assert near._take(1, time.monotonic_ns())[0] == 1
+    assert (near._frames["flags"][0], near._frames["can_id"][0]) == (flags, 0x123)
+    near.close()
+    far.close()
+
+
+def test_an_interface_that_sends_nothing_is_down_until_it_sends_again(monkeypatch):
+    """Whatever error somebody else left behind meanwhile."""
+    near, far = socket_pair()
+
+    def fails(*_):
+        ctypes.set_errno(errno.ENETDOWN)
+        return -1
+
+    with monkeypatch.context() as patched:
+        patched.setattr(rawcan, "_libc", SimpleNamespace(sendmmsg=fails))
+        near.send(np.zeros(3, FRAME))
+    assert near.down and near.unsent == 3
+    ctypes.set_errno(errno.EIO)
+    near.send(np.zeros(1, FRAME))
+    near.send(np.zeros(1, FRAME))
+    heard = far.drain()
+    assert not near.down and near.unsent == 3 and len(heard) == 2 and far._latest_ns == heard["time_ns"][1]
+    near.close()
+    far.close()

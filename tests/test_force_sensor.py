@@ -13,7 +13,10 @@ from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.calibration.parameters import moved, parameter
 from emb_daemon.calibration.types import ForceSensor, to_parameters
 from emb_daemon.errors import InputErrors
+from emb_daemon.estimator import force_sensor
+from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.logs.mapping import Mapping
+from emb_daemon.models.fusion import CONTACT, FAST, OF_THE_MODEL, SCALE, STATES
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios as sc
@@ -262,3 +265,65 @@ def test_its_section_of_the_calibration_is_checked(tmp_path):
     found = parameter(mounted, "force_sensor.offset_N_per_K")
     assert (found.value, found.unit, found.low) == (1.0, "N/K", 0.0)
     assert moved(mounted, {"force_sensor.limit_N": 4000.0}, checked=True).force_sensor.limit_N == 4000.0
+
+
+# The sensor alone.
+
+
+def _sensor(wrong=False, variance=2500.0):
+    """Its record in a STATE, with a zero known to 50 N, and a SAMPLE."""
+    s, m = new_state()[0], np.zeros(1, SAMPLE)[0]
+    s["sensor"]["started"], s["sensor"]["wrong"], s["sensor"]["variance"] = True, wrong, variance
+    s["sensor"]["zeroed"], m["caliper"], m["has_thermocouple"] = 20.0, 20.0, True
+    return s, m
+
+
+def test_the_zero_is_the_mean_of_what_open_pads_show_and_of_what_was_known(ideal):
+    """By their variances; from readings that are three sigma off, too."""
+    (s, m), q = _sensor(), ideal[1]["sensor"]
+    c, readings = s["sensor"], 150.0 + 10.0 * np.random.default_rng(1).standard_normal(40)
+    for value in readings:
+        m["sensor_force"] = value
+        force_sensor._find_zero(c, q, m, float(c["variance"]))
+    known = 1.0 / (1.0 / 50.0**2 + len(readings) / 10.0**2)
+    assert c["variance"] == pytest.approx(known) and c["offset"] == pytest.approx(known * readings.sum() / 10.0**2)
+    assert c["contradiction"] == 0.0
+
+
+def test_a_zero_that_jumps_is_disbelieved_before_it_is_found_anew(ideal):
+    (s, m), q = _sensor(variance=25.0), ideal[1]["sensor"]
+    c, m["sensor_force"] = s["sensor"], 2000.0
+    force_sensor._find_zero(c, q, m, 25.0)
+    assert (c["offset"], c["variance"]) == (0.0, 25.0) and c["contradiction"] > 100.0
+    c["wrong"] = True
+    force_sensor._find_zero(c, q, m, 25.0)
+    assert c["offset"] == pytest.approx(2000.0, abs=0.1) and c["variance"] == pytest.approx(10.0**2, rel=1e-3)
+
+
+def test_what_all_samples_of_a_stroke_share_is_zero_warmth_age_and_gain(ideal):
+    """1 N/K of a caliper that is 30 K warmer than at the last zero, a third of a cycle of a force that grows, 1 % of it."""
+    (s, m), p = _sensor(), ideal[1]
+    assert force_sensor._common(s, p, m, 0.0, 0.0) == pytest.approx(50.0)
+    m["caliper"], s["force"] = 50.0, 4000.0
+    expected = np.sqrt(50.0**2 + 30.0**2 + (0.3 * 400.0) ** 2 + 40.0**2)
+    assert force_sensor._common(s, p, m, 4000.0, 3600.0) == pytest.approx(expected)
+    m["has_thermocouple"] = False
+    assert force_sensor._common(s, p, m, 4000.0, 4000.0) == pytest.approx(np.hypot(50.0, 40.0))
+
+
+def test_no_number_of_values_teaches_more_than_their_common_error_allows():
+    """Nor is anything learned from one that is far off."""
+    rng, gain, h = np.random.default_rng(2), np.zeros(STATES), np.zeros(STATES)
+    h[CONTACT], h[SCALE], h[FAST] = -900.0, 8000.0, 40.0
+    x, P = np.zeros(STATES), np.diag(np.full(STATES, 1e-4))
+    P[FAST, FAST], noise, common = 1.0, 10.0, 30.0
+    total, share = force_sensor._learn(x, P, gain, h, 50.0, noise, common)
+    slow = (900.0**2 + 8000.0**2) * 1e-4
+    assert total == pytest.approx(slow + 40.0**2 + noise**2 + common**2) and 0.0 < share < 1.0
+    for _ in range(2000):
+        force_sensor._learn(x, P, gain, h, rng.normal(0.0, noise), noise, common)
+        P[FAST, FAST] = 1.0
+    of_model = np.where(np.isin(np.arange(STATES), OF_THE_MODEL), h, 0.0)
+    assert 0.99 * common**2 < of_model @ P @ of_model < 2.0 * common**2
+    before = x.copy()
+    assert force_sensor._learn(x, P, gain, h, 5000.0, noise, 1.0)[1] == 0.0 and np.array_equal(x, before)

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from emb_daemon.adapt.fit import fit_training
 from emb_daemon.adapt.records import ACCEPTED, TRAINING
@@ -22,7 +23,17 @@ from emb_daemon.identify.dynamics import Pads, fit_dynamics, starting_point
 from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps.torque import fit_torque
 from emb_daemon.logs.write import write_frames
-from emb_daemon.models.gear import all_through_gear, back_through_gear, most_of_spring, steepest, through_gear
+from emb_daemon.models.gear import (
+    GEAR,
+    INTERVALS,
+    all_through_gear,
+    back_through_gear,
+    fill_gear,
+    most_of_spring,
+    rising_slopes,
+    steepest,
+    through_gear,
+)
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline import estimate, load_log
 from emb_daemon.plant import scenarios as sc
@@ -243,3 +254,33 @@ def test_a_table_that_is_none_is_refused_in_words(shipped, angle, mm, says):
             msgspec.convert(data, Calibration)
         except msgspec.ValidationError as error:
             raise InvalidValue(str(error)) from None
+
+
+def test_a_travel_table_is_the_monotone_cubic_through_its_points():
+    """Of scipy, which has the same slopes but where the curve bends so much at an end that it would fall there."""
+    x, y = np.array([0.0, 3.0, 10.0, 12.0, 30.0, 41.0]), np.array([0.0, 3.5, 9.0, 10.0, 24.0, 35.0])
+    assert rising_slopes(x, y) == pytest.approx(PchipInterpolator(x, y).derivative()(x), rel=1e-12)
+    bent = np.array([0.0, 0.03, 9.0, 10.0, 24.0, 24.1])
+    slopes = rising_slopes(x, bent)
+    assert slopes[1:-1] == pytest.approx(PchipInterpolator(x, bent).derivative()(x)[1:-1], rel=1e-12)
+    assert slopes[[0, -1]] == pytest.approx([0.1 * 0.01, 0.1 * 0.1 / 11.0])
+    gear = np.zeros(1, GEAR)[0]
+    fill_gear(gear, x, y)
+    nodes, table = np.linspace(0.0, 41.0, INTERVALS + 1), CubicHermiteSpline(x, y, rising_slopes(x, y))
+    assert gear["turned"] == pytest.approx(table(nodes), rel=1e-12)
+    assert gear["slope"] == pytest.approx(table.derivative()(nodes), rel=1e-12)
+
+
+def test_between_its_nodes_a_gear_is_cubic_and_beyond_them_straight_and_there_is_one_way_back(shipped):
+    gear = ramp(shipped).motor.gear()
+    nodes = gear["step"] * np.arange(INTERVALS + 1)
+    cubic, angles = CubicHermiteSpline(nodes, gear["turned"], gear["slope"]), np.linspace(0.0, nodes[-1], 700)
+    turned_rad, slopes = all_through_gear(gear, angles)
+    assert turned_rad == pytest.approx(cubic(angles), rel=1e-12) and slopes == pytest.approx(
+        cubic.derivative()(angles), rel=1e-9
+    )
+    for way, end in ((-3.0, 0), (5.0, -1)):
+        beyond = nodes[end] + way
+        expected = gear["turned"][end] + way * gear["slope"][end]
+        assert through_gear(gear, beyond) == pytest.approx((expected, gear["slope"][end]))
+        assert back_through_gear(gear, expected) == pytest.approx(beyond)

@@ -196,3 +196,64 @@ def test_pads_forget_their_temperature_over_the_time_of_the_calibration(paramete
     warm = estimate(rows[5000:], parameters[:1], state)["mean"].mean(axis=1) - thermal["reference"]
     assert remembered < 0.5 * warm[0] and np.ptp(warm) < 1.0
     assert warm[-1] - state[0]["history"] == pytest.approx((warm[0] - remembered) * np.exp(-1.0), rel=0.05)
+
+
+def _warm(pads, disc, ambient=20.0):
+    """STATE of pads and disc whose temperatures are known, and a SAMPLE of the car at rest."""
+    s, m = new_state()[0], np.zeros(1, SAMPLE)[0]
+    s["temperature_known"], s["ambient_heard"], s["pads"], s["mean"], s["disc"] = True, True, pads, pads, disc
+    m["dt"], m["brake_torque"], m["has_status"], m["has_wheel_speed"], m["ambient"] = 0.004, np.nan, True, True, ambient
+    return s, m
+
+
+def test_heat_flows_every_twelve_samples(parameters):
+    s, m = _warm(200.0, 200.0)
+    flowed = []
+    for _ in range(24):
+        before = s["disc"].copy()
+        heat(s, parameters[0], m)
+        flowed.append(bool(s["disc"] != before))
+    assert np.flatnonzero(flowed).tolist() == [11, 23]
+
+
+def test_without_thermocouples_no_heat_passes_to_the_plates(parameters):
+    """Pads as warm as the disc and the air stay so, whatever the last message said of the plates."""
+    s, m = _warm(200.0, 200.0, ambient=200.0)
+    m["has_thermocouple"], m["inner_backplate"], m["outer_backplate"] = False, 20.0, -40.0
+    for _ in range(250):
+        heat(s, parameters[0], m)
+    assert s["pads"] == pytest.approx(np.full((2, NODES), 200.0)) and s["disc"] == pytest.approx(200.0)
+
+
+def test_softening_is_that_of_what_the_pads_are_and_have_been(parameters):
+    """Their rise over the temperature of the calibration, and its mean over the time that they remember."""
+    thermal = parameters[0]["thermal"]
+    thermal["softening"], thermal["softening_history"], thermal["history_time"] = 4e-4, 1e-3, 2.0
+    s, m = _warm(220.0, 220.0, ambient=220.0)
+    m["inner_backplate"] = m["outer_backplate"] = 220.0
+    m["has_thermocouple"], s["plate"], s["plate_mean"], s["history"] = True, 220.0, 220.0, 50.0
+    rise = 220.0 - thermal["reference"]
+    for _ in range(252):
+        heat(s, parameters[0], m)
+    remembered = rise + (50.0 - rise) * np.exp(-252 * 0.004 / 2.0)
+    assert s["history"] == pytest.approx(remembered) and s["factor"] == pytest.approx(1.0 - 4e-4 * rise - 1e-3 * remembered)
+
+
+@pytest.mark.parametrize(("cycle", "resumed", "wider"), [(0, False, True), (60, False, False), (0, True, False)])
+def test_air_that_is_colder_than_the_disc_tells_of_heat_on_its_way_only_at_the_start(parameters, cycle, resumed, wider):
+    """A vehicle status that comes later than it must may be of another weather; after a restart the heat was known."""
+    s, m = _warm(60.0, 60.0)
+    s["ambient_heard"], s["resumed"], s["temperature_sigma"], m["cycle"] = False, resumed, 1.0, cycle
+    heat(s, parameters[0], m)
+    assert (s["temperature_sigma"] > 100.0) == wider and (s["history_sigma"] > 100.0) == wider
+
+
+def test_pads_of_different_warmth_are_as_soft_after_a_restart_as_their_mean(parameters):
+    thermal = parameters[0]["thermal"]
+    thermal["softening"], thermal["softening_history"] = 4e-4, 0.0
+    s, m = _warm(100.0, 200.0)
+    s["temperature_known"], s["rested_s"], s["pads"][1] = False, 0.004, 300.0
+    m["has_thermocouple"], m["inner_backplate"], m["outer_backplate"] = True, 100.0, 300.0
+    heat(s, parameters[0], m)
+    assert s["mean"] == pytest.approx([100.0, 300.0], abs=3.0)
+    assert s["factor"] == pytest.approx(1.0 - 4e-4 * (s["mean"].mean() - thermal["reference"]))

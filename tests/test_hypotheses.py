@@ -419,6 +419,9 @@ def test_odds_are_likelihood_ratios_of_the_same_torque():
     a = new_state()["alternatives"][0, 0]
     weigh(a, PRIOR_ODDS, 100.0, 1.0, 4.0, 1.0, 1.0)
     assert a["log_odds"] == pytest.approx(0.125 - 0.5 + 0.5 * np.log(4.0))
+    a["log_odds"] = 0.0
+    weigh(a, PRIOR_ODDS, 100.0, 1.0, 1.0, 1.0, 4.0)
+    assert a["log_odds"] == pytest.approx(0.5 - 0.125 - 0.5 * np.log(4.0))
 
 
 def test_a_sample_far_off_counts_as_the_gates_edge():
@@ -676,6 +679,27 @@ def test_what_nothing_spoke_for_on_the_way_to_a_force_is_kept_for_the_way_back(p
     assert exists(kept)
     settle(s, p, True, 0.004)
     assert not exists(kept)
+
+
+def test_a_kept_jump_gives_way_to_none_that_is_less_likely_or_that_nothing_speaks_for(p, opened):
+    """Neither to one of its own kind, nor to one of the torque that was only expected."""
+    s = opened[0]
+    kept = _renewed(s, p, STIFFNESS_JUMP, PRIOR_ODDS + 0.4, released=False)
+    _renewed(s, p, STIFFNESS_JUMP, PRIOR_ODDS + 0.2, released=False)
+    assert kept["log_odds"] == kept["error"][SCALE] == PRIOR_ODDS + 0.4
+    s["alternatives"]["prior"][TORQUE_JUMP] = PRIOR_ODDS + 4.0
+    assert _renewed(s, p, TORQUE_JUMP, PRIOR_ODDS + 3.0, released=False)["kind"] == STIFFNESS_JUMP
+    s["alternatives"]["prior"][TORQUE_JUMP] = PRIOR_ODDS
+    assert _renewed(s, p, TORQUE_JUMP, PRIOR_ODDS + 3.0, released=False)["kind"] == TORQUE_JUMP
+
+
+def test_a_stop_ends_once_when_the_pads_have_left_the_disc(p, opened):
+    s, stops = opened[0], []
+    for engaged, released in ((False, True), (True, False), (True, False), (False, False), (False, True), (False, True)):
+        s["contact"]["engaged"] = engaged
+        settle(s, p, released, 0.004)
+        stops.append(float(s["stops"]))
+    assert stops == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0]
 
 
 def test_a_kept_jump_is_proven_as_any_and_no_rival_of_its_successor(p, opened):

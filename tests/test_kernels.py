@@ -3,6 +3,7 @@
 import naive
 import numpy as np
 import pytest
+from scipy.special import erfc
 
 from emb_daemon.models import contact
 from emb_daemon.models.fusion import (
@@ -24,6 +25,7 @@ from emb_daemon.models.thermal import (
     friction_power,
     heat_step,
     mean_temperature,
+    mesh,
     stiffness_factor,
 )
 from emb_daemon.models.torque import friction_state, torque_balance, unexplained_torque
@@ -137,6 +139,9 @@ def test_profile_of_a_pad(thermal):
     for share in (0.0, 0.2, 0.77, 1.0):
         assert at_depth(profile, positions, share * thickness) == pytest.approx(500.0 - 400.0 * share)
     assert np.isnan(at_depth(profile, positions, 1.01 * thickness))
+    steep = 400.0 * np.exp(-8.0 * positions / thickness)
+    for share in (0.05, 0.31, 0.64, 0.98):
+        assert at_depth(steep, positions, share * thickness) == pytest.approx(400.0 * np.exp(-8.0 * share), abs=2.0)
 
 
 def test_stiffness_factor(thermal):
@@ -160,3 +165,91 @@ def test_two_torques_where_none_is_believed_say_that_the_contact_comes_earlier_a
         assert found == [contact.NOTHING] * (samples - 1) + [expected]
         assert c["engaged"][0] == (expected == contact.TOO_LATE)
         assert (c["rise"][0], c["shortfall"][0], c["agreed"][0]) == (0.0, 0.0, 0)
+
+
+def test_the_mesh_goes_from_the_friction_surface_to_the_backing_plate():
+    """Each interval a tenth wider than the one before."""
+    nodes = mesh(0.012)
+    assert nodes[0] == 0.0 and nodes[-1] == pytest.approx(0.012) and len(nodes) == NODES
+    assert np.diff(nodes)[1:] == pytest.approx(1.1 * np.diff(nodes)[:-1])
+
+
+def test_noise_raises_an_alarm_of_the_contact_once_in_as_many_samples_as_promised():
+    """Mean run length of the one-sided sum of white noise (Brook and Evans, Biometrika 59, 1972): e^17 samples, and not ten
+    times as many."""
+    limit, states = contact.threshold(0.0, 0.02, 0.004), 400
+    width = limit / (states - 0.5)
+    edges = width * (np.arange(states + 1) - 0.5)
+    to = np.array(
+        [[0.5 * erfc(-(edge - start + 0.45) / np.sqrt(2.0)) for edge in edges] for start in width * np.arange(states)]
+    )
+    to[:, 0] = 0.0
+    run_length = np.linalg.solve(np.eye(states) - np.diff(to, axis=1), np.ones(states))[0]
+    assert 17.0 < np.log(run_length) < 17.0 + np.log(10.0)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_a_sum_of_correlated_noise_wanders_as_much_further_as_the_threshold_is_higher(share):
+    """Its variance is that of white noise times the sum of the correlations over all lags."""
+    lags = np.abs(np.arange(-1000, 1001))
+    further = share * np.exp(-lags * 0.004 / 0.02).sum() + 1.0 - share
+    assert contact.threshold(share, 0.02, 0.004) == pytest.approx(further * contact.threshold(0.0, 0.02, 0.004))
+
+
+def _closing(c, torque, predicted, samples, x=2.0, offset=0.0):
+    """What `watch_closing` finds in the last of some samples; noise of 0.01 N m, contact known to 0.02 rad, threshold 8."""
+    for _ in range(samples):
+        found = contact.watch_closing(c[0], torque, predicted, 1.0, 0.01, 8.0, x, 0.02, offset, 0.001, True)
+    return found
+
+
+def test_a_contact_angle_is_confirmed_by_a_hundred_samples_of_the_torque_that_it_needs():
+    """Not by a torque that noise would hide, and not where the sum is on its way to an alarm."""
+    c = np.zeros(1, contact.CONTACT)
+    _closing(c, 1.0, 1.0, 99)
+    assert not c["confirmed"][0]
+    _closing(c, 1.0, 1.0, 1)
+    assert c["confirmed"][0]
+    hidden = np.zeros(1, contact.CONTACT)
+    _closing(hidden, 0.02, 0.02, 500)
+    assert not hidden["confirmed"][0]
+    doubted = np.zeros(1, contact.CONTACT)
+    _closing(doubted, 1.0 - 0.07 - 0.001 - 0.0045 - 0.025, 1.0, 2)
+    assert _closing(doubted, 1.0 - 0.07 - 0.001 - 0.0045, 1.0, 500) == contact.NOTHING
+    assert doubted["shortfall"][0] == pytest.approx(5.0) and not doubted["confirmed"][0]
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, -0.5])
+@pytest.mark.parametrize(("first", "found"), [(0.0, contact.TOO_LATE), (0.004, contact.TOO_LATE), (0.04, contact.NOTHING)])
+def test_torque_over_the_clearances_is_an_offset_if_it_was_there_from_a_strokes_first_sample_and_else_a_force(
+    first, found, level
+):
+    """A force that grows after thirty samples without any, or with a little, is one; what was there at once is an offset. What
+    the clearance had before is neither."""
+    c = np.zeros(1, contact.CONTACT)
+    _closing(c, level, 0.0, 200, x=-5.0, offset=level)
+    contact.watch_closing(c[0], level, 0.0, -1.0, 0.01, 8.0, -5.0, 0.02, 0.0, 0.001, True)
+    said = [_closing(c, level + first, 0.0, 1, x=-5.0) for _ in range(8)]
+    grown = np.maximum(0.01 * np.arange(60) - 0.3, 0.0) * (first < 0.04)
+    said += [_closing(c, level + first + more, 0.0, 1, x=-5.0) for more in grown]
+    assert (contact.TOO_LATE in said) == (found == contact.TOO_LATE)
+    assert said.index(contact.TOO_LATE) > 30 if found == contact.TOO_LATE else c["samples"][0] < 100.0
+
+
+def test_another_contact_angle_is_watched_anew():
+    c, fresh = np.zeros((2, 1), contact.CONTACT)
+    _closing(c, 1.0, 0.9, 30)
+    contact.start_anew(c[0])
+    for name in ("rise", "shortfall", "excess", "watched", "agreed", "confirmed"):
+        assert c[name][0] == fresh[name][0], name
+    assert c["lost"][0]
+
+
+def test_what_is_clearly_above_noise_is_five_sigma_of_the_mean():
+    """Nothing is before the first sample."""
+    c = np.zeros(1, contact.CONTACT)
+    assert contact.clearly_above(c[0], 0.01) == np.inf
+    for samples in (1, 9, 15, 40):
+        c = np.zeros(1, contact.CONTACT)
+        _closing(c, 0.0, 0.0, samples)
+        assert contact.clearly_above(c[0], 0.01) == pytest.approx(0.05 / np.sqrt(min(samples, 15)))

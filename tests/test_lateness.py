@@ -17,6 +17,7 @@ from emb_daemon.models.lateness import (
     SLOWEST_S,
     find_filter,
     follow,
+    friction_since,
     interrupt,
     remember,
     speed_then,
@@ -25,7 +26,8 @@ from emb_daemon.models.lateness import (
     unfilter,
     way_beside,
 )
-from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG
+from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, UNDECIDED
+from emb_daemon.models.torque import friction_state
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import OUT_OF_RANGE, PATHS_DISAGREE
 
@@ -383,6 +385,13 @@ def test_a_sample_that_is_no_motion_is_not_followed(parameters, s, what):
     assert (s["lateness"]["sums"][0] != before["sums"][0]) == followed
 
 
+@pytest.mark.parametrize(("verdict", "followed"), [(AGREE, True), (UNDECIDED, True), (STIFFNESS_WRONG, False)])
+def test_a_resolver_that_is_not_believed_tells_of_no_drift(parameters, s, verdict, followed):
+    s["plausibility"]["verdict"] = verdict
+    step._follow_age(s, parameters[0], _turning(parameters[0]), _TURNED, False)
+    assert (s["wander"]["seconds"] == _DT) == (s["wander"]["slip"] != 0.0) == followed
+
+
 @pytest.mark.parametrize(("known_s", "left_s"), [(0.0, 0.007), (0.004, 0.003), (0.007, 0.0), (0.009, 0.0)])
 def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters, s, known_s, left_s):
     p, m = parameters[0], _turning(parameters[0])
@@ -540,3 +549,33 @@ def test_an_angle_that_is_frozen_while_the_motor_closes_slowly_is_no_offset_of_t
     error = np.abs(estimates["force"] - force[frozen:])
     told = estimates["reasons"] != 0
     assert np.flatnonzero(told)[0] * _DT < 2.0 and np.max(error[~told]) < 600.0 and error[-1] > 2.0 * np.max(error[~told])
+
+
+def test_an_offset_of_the_speed_is_the_mean_of_all_that_a_standing_motor_has_shown():
+    """From a fifth of a second on: fifty samples."""
+    a, speeds = np.zeros(1, LATENESS)[0], 0.5 + 0.1 * np.random.default_rng(6).standard_normal(400)
+    for number, speed in enumerate(speeds, 1):
+        stand(a, speed - float(a["offset"]), 0.1)
+        assert a["offset"] == pytest.approx(speeds[:number].mean() if number >= 50 else 0.0)
+
+
+@pytest.mark.parametrize("age", [0.004, 0.0065, 0.013])
+def test_friction_where_the_angle_is_late_is_that_of_the_motors_own_motion(age):
+    """But in a cycle in which it turns back: the state by the late angle, slid on by the speeds since."""
+    (angle, speed), w, presliding = _strokes(), np.zeros(1, LATELY)[0], 0.2
+    state = own = 0.0
+    for now in np.arange(0.05, 1.5, _DT):
+        remember(w, speed(now), _DT)
+        state, mean, _ = friction_state(state, 0.0, angle(now - age) - angle(now - age - _DT), presliding, 0.0, _DT)
+        own, expected, _ = friction_state(own, 0.0, angle(now) - angle(now - _DT), presliding, 0.0, _DT)
+        if now > 0.2 and np.abs(speed(now - np.arange(0.0, age + 2.0 * _DT, 0.001))).min() > 3.0:
+            assert friction_since(w, state, mean, age, 0.0, presliding) == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize(("speed", "turns_over"), [(0.25, True), (0.02, False)])
+def test_speeds_within_their_noise_turn_friction_over_once_their_sum_is_more_than_noise_makes(speed, turns_over):
+    """A speed's noise of 0.3 rad/s adds up to 0.004 rad in 50 ms."""
+    w = np.zeros(1, LATELY)[0]
+    for _ in range(20):
+        remember(w, -speed, _DT)
+    assert (friction_since(w, 1.0, 1.0, 0.048, 0.3, 0.002) < 0.0) == turns_over

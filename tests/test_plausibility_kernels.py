@@ -327,3 +327,28 @@ def test_what_friction_carries_grows_with_the_clamp_force():
     for force, most in ((30_000.0, 1.1), (0.0, 0.32 / 0.35)):
         assert _swings([0.0, 0.99 * most], presliding_angle=1e-4, force=force, load=1e-5) == 0
         assert _swings([0.0, 1.01 * most], presliding_angle=1e-4, force=force, load=1e-5) == 1
+
+
+@pytest.mark.parametrize("torque", [-3.0, 0.5, 3.0])
+def test_a_torque_that_does_not_swing_has_turned_no_motor(torque):
+    """However large it is."""
+    c = np.zeros(1, PLAUSIBILITY)[0]
+    for _ in range(200):
+        steady(c, torque, 0.0, _DT)
+    stands(c, 1.0)
+    for _ in range(500):
+        steady(c, torque, 0.0, _DT)
+        assert stands(c, 0.0) in (True, False) and hold(c, 0.0, 0.006, 4e-5, 4e-6, 0.1, 0.01, 0.0, 0.03) == 0
+
+
+def test_a_motor_without_torque_beyond_friction_is_never_due():
+    c = np.zeros(1, PLAUSIBILITY)[0]
+    assert not any(stands(c, 0.0) and due(c, 0.0, 0.0, _DT) for _ in range(1000))
+
+
+@pytest.mark.parametrize("limit", [0.4, 12.0])
+def test_a_current_at_its_sensors_limit_is_frozen_whatever_that_is(limit):
+    w = Watched()
+    w.c["limit"] = w.c["largest"] = limit
+    assert w.pass_by(1, speed=50.0, current=-limit) == TORQUE_FROZEN
+    assert w.pass_by(1, speed=50.0, current=0.9 * limit) == AGREE

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import restart
+from emb_daemon.estimator.contact import _start_clamped, seek_release
 from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.step import step
-from emb_daemon.models.fusion import FAST, NOISE
-from emb_daemon.models.stiffness import travel_at
+from emb_daemon.models.fusion import CONTACT, FAST, NOISE, OFFSET, SCALE
+from emb_daemon.models.stiffness import characteristic_curve, travel_at
+from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
 
@@ -257,11 +259,12 @@ def test_after_a_restart_the_time_since_the_snapshot_tells_what_pads_may_remembe
     estimate(rows, p, state)
     assert restart.take_snapshot(state[0], p, snapshot)
     rested, sigmas = _standing(p)[0], {}
-    for elapsed_s in (10.0, 900.0):
+    for elapsed_s in (10.0, 11.0, 900.0):
         restarted = new_state()
         restart.resume(restarted[0], p, snapshot, elapsed_s)
         sigmas[elapsed_s] = estimate(rested, p, restarted)["sigma"][1]
     assert sigmas[10.0] > 1.3 * estimate(rested, p)["sigma"][1] and sigmas[900.0] < 1.1 * p["stiffness_sigma"]
+    assert sigmas[11.0] < 0.9 * sigmas[10.0], "a second later they have forgotten a third of it"
 
 
 @pytest.mark.parametrize(("elapsed_s", "disc", "pads"), [(0.1, 200.0, 197.3), (300.0, 141.0, 69.4)])
@@ -280,6 +283,8 @@ def test_after_a_restart_pads_and_disc_have_cooled_for_as_long_as_they_rested(p,
     assert resumed["disc"] == pytest.approx(disc, abs=0.5) and resumed["mean"] == pytest.approx([pads, pads], abs=0.5)
     rise = 200.0 - p["thermal"]["reference"]
     assert resumed["history"] == pytest.approx(rise + (50.0 - rise) * np.exp(-elapsed_s / 100.0), abs=0.1)
+    softened = stiffness_factor(p["thermal"], pads - p["thermal"]["reference"], resumed["history"])
+    assert resumed["factor"] == pytest.approx(softened, abs=5e-4)
 
 
 def test_an_error_of_ten_sigma_is_no_brakes(p):
@@ -291,3 +296,135 @@ def test_an_error_of_ten_sigma_is_no_brakes(p):
     for sigmas, told in ((9.9, ""), (-10.1, "error")):
         snapshot["error"] = sigmas * sigma
         assert restart.why_implausible(snapshot, p) == told
+
+
+def _snapshot(p):
+    """SNAPSHOT of a brake that has just been switched on."""
+    s, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
+    step(s, p, _standing(p)[0][0], np.zeros(1, ESTIMATE)[0])
+    assert restart.take_snapshot(s, p, snapshot)
+    return snapshot
+
+
+@pytest.mark.parametrize(
+    ("name", "possible", "impossible"),
+    [
+        ("clearance_sigma", (0.0, 20.0), (-1e-6, 30.0)),
+        ("scale", (0.6, 1.6), (0.0, 9.0)),
+        ("growth", (0.06, -0.06), (0.07, -0.07)),
+        ("winding", (0.0, 4.0), (-0.01, 4.01)),
+        ("housing", (0.0, 4.0), (-0.01, 4.01)),
+        ("filtered", (0.0, 0.048), (-0.001, 0.05)),
+        ("pads", (-60.0, 1200.0), (-61.0, 1201.0)),
+        ("disc", (-60.0, 1200.0), (-61.0, 1201.0)),
+        ("growth_start", (-60.0, 1200.0), (-61.0, 1201.0)),
+        ("history", (-1200.0, 1200.0), (-1201.0, 1201.0)),
+        ("temperature_sigma", (0.0, 1200.0), (-0.1, 1201.0)),
+        ("history_sigma", (0.0, 1200.0), (-0.1, 1201.0)),
+    ],
+)
+def test_what_no_brake_can_be_is_named(p, name, possible, impossible):
+    """Contact within a millimetre of the calibration's, growth up to ten times that of an iron disc, temperatures that a pad
+    survives, heat and filters as large as they get."""
+    p["gear_gain"] = 4e-5
+    for values, told in ((possible, ""), (impossible, name)):
+        for value in values:
+            snapshot = _snapshot(p)
+            snapshot[name] = value
+            assert restart.why_implausible(snapshot, p) == told, value
+
+
+@pytest.mark.parametrize(
+    ("correlation", "told"), [(0.99, ""), (-1.0, ""), (1.1, "covariance"), (-1.5, "covariance"), (np.nan, "covariance")]
+)
+def test_errors_that_are_correlated_by_more_than_all_are_no_brakes(p, correlation, told):
+    snapshot = _snapshot(p)
+    sigma = np.sqrt(np.diag(snapshot["covariance"]))
+    snapshot["covariance"] = np.diag(sigma**2)
+    snapshot["covariance"][CONTACT, SCALE] = snapshot["covariance"][SCALE, CONTACT] = (
+        correlation * sigma[CONTACT] * sigma[SCALE]
+    )
+    assert restart.why_implausible(snapshot, p) == told
+
+
+def test_temperatures_of_pads_that_were_never_known_may_be_anything(p):
+    snapshot = _snapshot(p)
+    snapshot["temperature_known"], snapshot["disc"] = False, 9e9
+    assert restart.why_implausible(snapshot, p) == ""
+
+
+# The search alone.
+
+
+@pytest.fixture
+def unknown(p):
+    """STATE of a brake that started clamped, and a SAMPLE of its motor, which stands; nobody brakes."""
+    s, m = new_state()[0], _standing(p)[0][1]
+    step(s, p, m, np.zeros(1, ESTIMATE)[0])
+    s["seen"], s["unknown"], s["since_start_s"] = True, True, 1.0
+    return s, m
+
+
+def _known_after(s, p, m, seconds):
+    """Time (s) after which the contact is known, infinite if it is not within ``seconds``."""
+    for number in range(round(seconds / 0.004)):
+        seek_release(s, p, m)
+        if not s["unknown"]:
+            return 0.004 * (number + 1)
+    return np.inf
+
+
+@pytest.mark.parametrize(("share", "after_s"), [(0.0, 0.1), (0.025, 0.1), (-0.025, 0.1), (0.035, 1.0), (-0.2, 1.0)])
+def test_a_motor_that_stands_released_is_known_in_a_tenth_of_a_second_without_torque_and_in_one_with(
+    p, unknown, share, after_s
+):
+    """Beyond friction, 3 % of what the largest force needs are an ordinary sensor's offset; what is more is one, too, if it
+    lasts, and is known to be one from then on."""
+    s, m = unknown
+    torque = share * p["gear_gain"] * p["maximum_force"] + np.sign(share) * p["offset_friction"]
+    s["plausibility"]["torque_mean"], m["angle"] = torque, s["angle"]
+    offset = float(s["error"][OFFSET])
+    assert _known_after(s, p, m, 2.0) == pytest.approx(after_s, abs=0.005)
+    assert s["contact_angle"] == pytest.approx(m["angle"] + p["clearance"])
+    assert s["error"][OFFSET] - offset == pytest.approx(torque if after_s == 1.0 else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("park_brake", 1.0), ("brake_request", 1.0), ("has_status", False), ("angle", None)]
+)
+def test_where_somebody_may_brake_or_the_motor_moves_nothing_is_known(p, unknown, name, value):
+    s, m = unknown
+    m[name] = s["angle"] + 0.01 if value is None else value
+    assert _known_after(s, p, m, 3.0) == np.inf
+
+
+@pytest.mark.parametrize(("share", "torque_share", "known"), [(0.5, 0.0, True), (0.25, 0.0, False), (0.5, 0.03, False)])
+def test_who_closes_through_a_third_of_the_clearance_without_any_force_was_released(p, unknown, share, torque_share, known):
+    s, m = unknown
+    m["brake_request"], s["start_angle"], s["friction_mean"] = 1.0, s["angle"], 1.0
+    s["balance"] = torque_share * p["gear_gain"] * p["maximum_force"]
+    begun = float(s["start_angle"])
+    for angle in begun + np.linspace(0.0, share * p["clearance"], 100):
+        m["angle"] = angle
+        seek_release(s, p, m)
+    assert s["unknown"] != known
+    if known:
+        assert s["contact_angle"] == pytest.approx(begun + p["clearance"])
+
+
+def test_a_torque_at_power_on_may_be_a_clamped_brake_or_an_offset_of_as_much(p, unknown):
+    """The force is what the torque says; contact and offset are wrong together, or neither is."""
+    s, m = unknown
+    leverage, torque = p["gear_gain"] + p["load_friction"], 0.3
+    before = float(s["covariance"][OFFSET, OFFSET])
+    _start_clamped(s, p, m, torque, 0.01, leverage)
+    P, (force, slope) = s["covariance"], characteristic_curve(s["past_contact"], p["curve"])
+    assert s["force"] == pytest.approx(torque / leverage, rel=1e-3) == pytest.approx(s["factor"] * force, rel=1e-3)
+    assert s["contact_angle"] + s["past_contact"] == pytest.approx(s["angle"])
+    assert P[OFFSET, OFFSET] == pytest.approx(before + torque**2)
+    assert (
+        P[CONTACT, OFFSET]
+        == P[OFFSET, CONTACT]
+        == pytest.approx(P[OFFSET, OFFSET] / (leverage * s["factor"] * slope), rel=1e-3)
+    )
+    assert P[CONTACT, CONTACT] * P[OFFSET, OFFSET] >= P[CONTACT, OFFSET] ** 2

@@ -113,6 +113,14 @@ def test_temperature(seen):
     assert seen.facts() == {"temperature_unknown"}
 
 
+@pytest.mark.parametrize("rate", [0.002, -0.002])
+def test_a_zero_that_wanders_is_told_of_a_brake_whose_clearance_is_not_certain(seen, rate):
+    seen.state["straying"]["rate"] = rate
+    assert seen.facts() == {"zero_wanders"}
+    seen.p["clearance_sigma"] = 0.0
+    assert seen.facts() == set()
+
+
 def test_stuck_thermocouple_and_contradicted_wheel(seen):
     seen.state["plate_stuck"] = True
     seen.state["wheel"]["contradicted"] = True

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator.common import common_sigma
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
+from emb_daemon.estimator.status import ZERO_WANDERS
 from emb_daemon.estimator.step import predict, step
 from emb_daemon.estimator.unknown import add_softening, set_priors
 from emb_daemon.models.fusion import CONTACT, OF_THE_MODEL, SCALE, STATES, maximum_likelihood
@@ -40,6 +42,7 @@ def test_a_brake_that_is_switched_on_is_taken_for_released(p):
     assert out["contact_sigma"] > p["clearance_sigma"], "another contact is possible"
     assert (out["force"], out["stiffness_force"], out["stiffness_factor"]) == (0.0, 0.0, pytest.approx(1.0, abs=0.01))
     assert np.isnan(out["torque_force"]) and out["ml_force"] == 0.0
+    assert out["facts"] & ZERO_WANDERS == 0 and common_sigma(state, p) == 0.0
 
 
 def test_a_brake_that_is_held_as_known_has_no_other_stiffness(p):
@@ -115,6 +118,9 @@ def test_pads_begin_as_warm_as_their_plates_and_until_those_are_heard_as_in_the_
     step(state, p, plates, out)
     assert state["disc"] == 60.0 and state["history"] == pytest.approx(60.0 - p["thermal"]["reference"])
     assert state["mean"] == pytest.approx([75.0, 45.0], abs=3.0)
+    state["disc"], plates["dt"] = 300.0, 0.004
+    step(state, p, plates, out)
+    assert state["growth_start"] == 60.0, "where its growth counts from"
 
 
 @pytest.mark.parametrize("late", [0, 2])
@@ -143,6 +149,11 @@ def test_a_motor_that_stands_shows_the_noise_of_its_speed(p):
     assert standing(p, speeds[:40]) < 0.4 * noise
     assert standing(p, 0.1 * p["speed_sigma"] * np.sign(speeds)) == p["speed_sigma"]
     assert standing(p, speeds, turned_rad=0.004 * noise) == p["speed_sigma"]
+
+
+def test_a_motor_that_has_just_stopped_shows_none_yet(p):
+    """Its angle may be late, and stand while the motor still turns."""
+    assert standing(p, np.full(20, 20.0 * p["speed_sigma"])) == p["speed_sigma"]
 
 
 @pytest.mark.parametrize(("age", "source"), [(0.004, r.PREDICTED), (0.1, r.PREDICTED), (0.104, r.INVALID)])

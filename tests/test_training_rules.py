@@ -649,6 +649,21 @@ def test_a_stroke_that_contradicts_driving_is_believed_by_what_may_have_happened
     assert np.mean(error**2) < min(np.mean(weighed**2), np.mean((moved - truth)[apart] ** 2))
 
 
+@pytest.mark.parametrize("moved", [-0.9, 0.25, 0.6])
+def test_a_stroke_that_contradicts_driving_leaves_the_mean_and_the_variance_of_all_brakes_that_may_have_made_it(moved):
+    """By Bayes' rule over every contact angle: that of a brake that is the filter's, that has jumped, or that drifts."""
+    known, seen, odds, contact = 0.02, 0.1, np.exp([0.0, -3.0, -0.7]), np.linspace(-4.0, 4.0, 80_001)
+    state, p = _known_to(known, 0.3, -3.0, -0.7)
+    state["alternatives"]["error"][DRIFT, CONTACT] = 0.2
+    mean, sigma = np.array([0.0, 0.0, 0.2]), np.array([known, np.hypot(known, contact_jump(p)), 0.3])
+    prior = (odds / sigma * np.exp(-0.5 * ((contact[:, None] - mean) / sigma) ** 2)).sum(axis=1)
+    weight = prior * np.exp(-0.5 * ((moved - contact) / seen) ** 2)
+    weight /= weight.sum()
+    shift = weight @ contact
+    expected = (shift, weight @ (contact - shift) ** 2)
+    assert training._combine(state, p, moved, seen**2) == pytest.approx(expected, rel=1e-4)
+
+
 def test_what_spoke_for_a_jump_before_the_last_release_still_speaks_for_it():
     state, p = _known_to(0.02, 0.02, PRIOR_ODDS, -6.0)
     doubted, _ = training._combine(state, p, 0.3, 0.01)

@@ -306,3 +306,27 @@ def test_the_way_of_the_force_over_a_turn_is_what_such_a_disc_makes(share):
         u["amplitude"][2 * order - 2], u["amplitude"][2 * order - 1] = cosine, sine
         shift = 2e7 * (cosine * np.cos(order * angle) + sine * np.sin(order * angle))
         assert 2.0 * np.pi * uneven.way_per_rad(u) == pytest.approx(share * np.abs(np.diff(shift)).sum(), rel=1e-3)
+
+
+@pytest.mark.parametrize("foretold", [0.5, -0.3])
+def test_the_odds_of_a_disc_are_how_much_better_it_foretold_a_torque(u, foretold):
+    """Ratio of normal likelihoods; five sigma count at most."""
+    u["force"][:2], u["earlier"][:2], variance = (1000.0, 500.0), (foretold * 8e-4, foretold * 4e-4), 1e-4
+    for without in (0.004, -0.02):
+        u["log_odds"], expected = 0.3, _LEVERAGE * foretold
+        uneven._weigh(u, _LEVERAGE, without, variance)
+        better = 0.5 * (without**2 - (without - expected) ** 2) / variance
+        assert u["log_odds"] == pytest.approx(0.3 + better)
+    u["log_odds"], u["earlier"] = 0.0, 0.0
+    uneven._weigh(u, _LEVERAGE, 10.0, variance)
+    assert u["log_odds"] == 0.0
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_each_order_is_told_by_how_far_it_moves_the_force_over_a_turn(u, order):
+    """Ten micrometres on 2 kN/rad, wherever in its turn the disc is."""
+    u["share"], u["amplitude"][2 * order - 2 : 2 * order] = 0.3, (6e-6, -8e-6)
+    for angle in (0.0, 1.0, 2.5):
+        u["force"] = [_SLOPE / 4e-5 * part(k * angle) for k in (1, 2) for part in (np.cos, np.sin)]
+        assert uneven.unproven(u) == pytest.approx(0.3 * _SLOPE * 10e-6 / 4e-5)
+        assert uneven.way_per_rad(u) == pytest.approx(0.3 * 2.0 / np.pi * order * _SLOPE * 10e-6 / 4e-5)

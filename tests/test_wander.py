@@ -7,6 +7,7 @@ import pytest
 from emb_daemon.estimator.contact import place_contact
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.straying import attribute_straying, follow_straying, straying_sigma
+from emb_daemon.models import wander
 from emb_daemon.models.fusion import CONTACT, COULOMB, OFFSET
 from emb_daemon.models.wander import WANDER, leave_stretch, watch_wander
 from emb_daemon.offline import estimate
@@ -313,3 +314,29 @@ def test_what_strays_counts_by_what_is_not_known_of_its_share(resting):
     assert straying_sigma(resting, 10.0) == pytest.approx(0.5)
     resting["straying"]["told"] = 96.0
     assert straying_sigma(resting, 10.0) == pytest.approx(0.1)
+
+
+def test_drift_and_loss_are_the_least_squares_of_all_stretches_by_what_is_possible():
+    """Stretches count less the longer ago they are; what looks like before is the speed's offset, and known as well."""
+    a, rng, noise = np.zeros(1, WANDER)[0], np.random.default_rng(7), 0.3
+    causes, normal, right = ("seconds", "way", "net", "gained"), np.zeros((4, 4)), np.zeros(4)
+    order = [wander._RATE, wander._LOSS, wander._GAIN, wander._AGE]
+    for _ in range(12):
+        a["seconds"], a["way"], a["net"], a["gained"] = rng.uniform([2.0, 20.0, -30.0, -60.0], [8.0, 80.0, 30.0, 60.0])
+        a["slip"] = 0.06 * a["seconds"] - 0.004 * a["way"] + 0.01 * rng.standard_normal()
+        cause = np.zeros(4)
+        cause[order] = [a[name] for name in causes]
+        variance = noise**2 * _DT * a["seconds"] + wander.COUNTS_RAD**2 + (wander._MISSED * a["way"]) ** 2
+        keep, known = np.exp(-a["seconds"] / wander._KEPT_S), float(a["offset_weight"])
+        known *= np.exp(-a["seconds"] / wander._OFFSET_CHANGES_S)
+        normal, right = keep * normal + np.outer(cause, cause) / variance, keep * right + cause * a["slip"] / variance
+        whole = np.linalg.inv(normal + np.diag(wander._POSSIBLE))
+        found = whole @ right
+        wander._take_stretch(a, noise)
+        for name, state in (("drift", wander._RATE), ("loss", wander._LOSS)):
+            told = abs(found[state]) > wander._LIKELY * np.sqrt(whole[state, state])
+            assert a[name] == pytest.approx(found[state] if told else 0.0)
+        if a["offset_weight"] > known * (1.0 + 1e-9):
+            more = a["seconds"] / (wander._KEPT_S * whole[wander._RATE, wander._RATE])
+            assert a["offset_weight"] - known == pytest.approx(more)
+    assert a["loss"] != 0.0 and a["drift"] != 0.0 and a["offset_weight"] > 0.0

@@ -5,6 +5,7 @@ import pytest
 
 from emb_daemon.estimator.records import SAMPLE
 from emb_daemon.estimator.wheel import WHEEL, disc_speed
+from emb_daemon.models.wheel import wheel_angle
 
 _DT = 0.004
 _PULSES_PER_RAD = 96 / (2.0 * np.pi)
@@ -163,3 +164,26 @@ def test_what_is_not_seen_to_heat_may_have_heated(parameters):
     blind = estimate(rows, p)
     assert blind["reasons"][-1] & TEMPERATURE_UNCERTAIN
     assert blind["sigma"][-1] > good["sigma"][-1]
+
+
+@pytest.mark.parametrize("speed", [0.4, 7.0, 40.0, 120.0])
+def test_the_angle_of_a_wheel_is_that_of_its_pulses_through_the_counters_wrap(speed):
+    """Within a pulse after a second: by a message every 20 ms, which was sent half a sample ago, and by the wheel speed."""
+    width, rows = 2.0 * np.pi / 96, np.zeros(2500, SAMPLE)
+    turned = 3990.3 * width + speed * _DT * np.arange(len(rows))
+    rows["dt"], rows["wheel_speed"], rows["has_wheel_speed"], rows["has_wheel_pulse"] = _DT, speed, True, True
+    sent = np.floor((turned - 0.5 * speed * _DT) / width) % 4096
+    rows["wheel_pulse"] = sent[np.arange(len(rows)) // 5 * 5]
+    assert np.abs(wheel_angle(rows) - turned)[250:].max() < width
+    rows["has_wheel_speed"] = False
+    # Nothing carries the angle on between the messages, and it is where the last count says.
+    late = speed * _DT * (np.arange(len(rows)) % 5 + 0.5)
+    assert np.abs(wheel_angle(rows) + late - turned).max() < 3.0 * width
+
+
+def test_a_wheel_without_pulses_has_the_angle_of_the_last():
+    rows = np.zeros(6, SAMPLE)
+    rows["dt"], rows["wheel_speed"], rows["has_wheel_speed"], rows["wheel_pulse"] = _DT, 40.0, True, 960.0
+    rows["has_wheel_pulse"][2:4] = True
+    first = 960.5 * 2.0 * np.pi / 96
+    assert wheel_angle(rows) == pytest.approx([0.0, 0.0, first, first + 0.16, first + 0.16, first + 0.16])

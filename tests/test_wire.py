@@ -2,6 +2,7 @@
 
 import re
 
+import cantools
 import numpy as np
 import pytest
 import wirekit
@@ -15,7 +16,7 @@ from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import MODES, REASONS, REQUESTS, RESULTS, reason_words
 from emb_daemon.wire.e2e import crc, protect
-from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE
+from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE, row_of
 from emb_daemon.wire.layout import CORNERS, _concerning, default_layout, load_layout, pack, unpack
 from emb_daemon.wire.receive import (
     ACCEPTED,
@@ -163,6 +164,20 @@ def test_one_count_beyond_its_range_a_number_is_refused():
                 assert _receive(sent, new_reception())[1] == BAD_RANGE, signal.name
                 tried += 1
     assert tried
+
+
+_WITHOUT_RANGES = """VERSION ""
+BU_: X
+BO_ 256 M: 8 X
+ SG_ Unsigned : 16|12@1+ (0.5,-10) [0|0] "" X
+ SG_ Signed : 32|12@1- (0.5,-10) [0|0] "" X
+"""
+
+
+@pytest.mark.parametrize(("name", "low", "high"), [("Unsigned", 0, 4095), ("Signed", -2048, 2047)])
+def test_a_signal_without_a_stated_range_has_that_of_its_bits(name, low, high):
+    signal = wire.signal_columns(cantools.database.load_string(_WITHOUT_RANGES, "dbc"), "M", (name,))[0]
+    assert (signal["low"], signal["high"]) == (0.5 * low - 10.0, 0.5 * high - 10.0)
 
 
 @given(st.sampled_from(_NAMES), st.sampled_from([np.inf, -np.inf, np.nan, 1e300, -1e300]))
@@ -323,6 +338,47 @@ def test_a_restarted_sender_is_believed_at_its_second_frame(heard):
 def test_time_that_steps_back_costs_one_frame(heard):
     verdicts = [_receive(_resolver(2 + n, -5_000 * MS + 4 * MS * n), heard)[1] for n in range(4)]
     assert verdicts[1:] == [ACCEPTED] * 3
+
+
+@pytest.mark.parametrize(("apart_ms", "believed"), [(1.6, False), (2.0, True), (4.0, True)])
+def test_a_restarted_sender_is_believed_if_its_second_frame_comes_half_a_cycle_later_or_more(heard, apart_ms, believed):
+    """Two frames in a burst may both be somebody else's."""
+    _refused(heard, _resolver(9, 8 * MS), BAD_COUNTER)
+    verdict = _receive(_resolver(10, 8 * MS + round(apart_ms * MS)), heard)[1]
+    assert verdict == (ACCEPTED if believed else BAD_COUNTER)
+
+
+def test_what_is_accepted_does_not_depend_on_when_the_clock_began():
+    """A million frames into a drive and years after a start: late, early, lost, repeated and foreign ones."""
+    rng, verdicts = np.random.default_rng(7), []
+    late_ns, counters = (
+        rng.choice([0, 0, 0, 0, 1, 3, -2, -3], 400) * MS,
+        np.arange(400) + rng.choice([0, 0, 0, 0, 0, 1, 7], 400),
+    )
+    for begin_ns in (0, 3 * 10**17):
+        receptions = new_reception()
+        verdicts.append([
+            _receive(_resolver(int(counter) % 15, begin_ns + 4 * MS * cycle + int(late_ns[cycle])), receptions)[1]
+            for cycle, counter in enumerate(counters)
+        ])  # fmt: skip
+    assert verdicts[0] == verdicts[1] and set(verdicts[0]) == {ACCEPTED, BAD_COUNTER}
+
+
+@pytest.mark.parametrize("early_ms", [1.9, 2.1])
+def test_a_frame_is_half_a_cycle_early_at_most_at_any_time(early_ms):
+    """Once 128 frames have shown the schedule."""
+    receptions, begin_ns = new_reception(), 3 * 10**17
+    for cycle in range(300):
+        assert _receive(_resolver(cycle % 15, begin_ns + 4 * MS * cycle), receptions)[1] == ACCEPTED
+    verdict = _receive(_resolver(0, begin_ns + 1200 * MS - round(early_ms * MS)), receptions)[1]
+    assert verdict == (ACCEPTED if early_ms < 2.0 else BAD_COUNTER)
+
+
+def test_of_can_fd_the_first_eight_bytes_are_kept():
+    import can
+
+    message = can.Message(arbitration_id=0x100, data=bytes(range(1, 65)), is_fd=True, is_extended_id=False)
+    assert row_of(message, 7) == (7, 0x0807060504030201, 0x100, 64, FD)
 
 
 def test_counter_fifteen_does_not_exist(heard):

@@ -90,9 +90,9 @@ def rising_slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     slopes = np.empty(len(x))
     slopes[1:-1] = (before + after) / (before / chord[:-1] + after / chord[1:])
     for end, inner in ((0, 1), (-1, -2)):
-        # Through three points, and no further from the chord than keeps the cubic rising.
+        # Through three points, which is never too steep for a rising cubic, and flat by nine tenths at most.
         straight = chord[end] + (chord[end] - chord[inner]) * width[end] / (width[end] + width[inner])
-        slopes[end] = np.clip(straight, 0.1 * chord[end], 3.0 * chord[end])
+        slopes[end] = max(straight, 0.1 * chord[end])
     return slopes
 
 

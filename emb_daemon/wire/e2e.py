@@ -29,8 +29,7 @@ _TABLE = _crc_table()
 @njit
 def crc(can_id: Integer, data: Integer) -> Integer:
     """CRC byte of a frame: ``can_id`` is the DataID, ``data`` the payload as an integer, whose CRC byte is ignored."""
-    value = np.uint8(0)
-    value = _TABLE[value ^ np.uint8(can_id & 0xFF)]
+    value = _TABLE[can_id & 0xFF]
     value = _TABLE[value ^ np.uint8((can_id >> 8) & 0xFF)]
     for byte in range(1, 8):
         value = _TABLE[value ^ np.uint8((np.uint64(data) >> np.uint64(8 * byte)) & np.uint64(0xFF))]
