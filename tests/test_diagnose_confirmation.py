@@ -186,7 +186,7 @@ def test_validation_logs_speak_of_the_whole_estimator_beside_left_out_episodes(v
 
 def test_an_effect_is_judged_on_its_own_path_with_the_contact_held(judged, monkeypatch):
     """What the contact angle learns of the other path is no word on it; what is left of its own on left-out episodes is."""
-    judge_left_out, left_out = confirmation.left_out_errors, confirmation._left_out_residuals
+    judge_left_out, left_out = confirmation.left_out_errors, confirmation.left_out_residuals
 
     def worse_while_learning(selection, without=""):
         errors = judge_left_out(selection, without)
@@ -200,7 +200,7 @@ def test_an_effect_is_judged_on_its_own_path_with_the_contact_held(judged, monke
         found = left_out(selection, without)
         return found | {"torque": found["torque"] * (4.0 if selection.accepted and not without else 1.0)}
 
-    monkeypatch.setattr(confirmation, "_left_out_residuals", worse)
+    monkeypatch.setattr(confirmation, "left_out_residuals", worse)
     refused = next(f for f in judged().findings if f.effect.name == "viscous_friction")
     assert not refused.accepted and "left of the torque path goes from" in refused.reason
 
@@ -381,7 +381,7 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
         near = own_path_N if "wrong" in there else 20.0
         return {"torque": np.where(by_sample < 4, 1000.0, near - 1.0 * ("right" in there))}
 
-    monkeypatch.setattr(confirmation, "_left_out_residuals", residuals)
+    monkeypatch.setattr(confirmation, "left_out_residuals", residuals)
 
     def left_out(chosen, without=""):
         there = {*chosen.suspects} - {without}

@@ -105,7 +105,7 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    parts = (_worse, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    parts = (_worse, _plain, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
 
@@ -113,6 +113,17 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
     """Logs that have lost by what was found, whatever the others gain."""
     logs = [f"{log} ({before:.1f} N → {after:.1f} N)" for log, before, after in diagnosis.worse]
     return [f"Worse on {', '.join(logs)}."] if logs else []
+
+
+def _plain(diagnosis: Diagnosis) -> list[str]:
+    """A plain fit is better than what was found: the calibration is not as good as the logs allow."""
+    if not diagnosis.plainly_better:
+        return []
+    plain_N, ours_N = diagnosis.plainly_better
+    return [
+        "Plain least squares with constant, offset, Coulomb and viscous friction, fitted to the same logs, leave "
+        f"{plain_N:.4g} N of the torque path, and this calibration {ours_N:.4g} N: it is not as good as these logs allow."
+    ]
 
 
 def _late(diagnosis: Diagnosis) -> list[str]:
