@@ -145,13 +145,15 @@ class Model:
         return model
 
     def _weighed(self, channel: str) -> "Model":
-        """A channel fitted with its priors weighed by what the fit leaves: by what was left before it, a calibration that is
-        far off would hold itself back."""
-        model = self
-        for _ in range(_FITS):
-            before, model = model, model._fitted(channel)
-            if model._variance(channel) > _AS_WEIGHED * before._variance(channel):
-                break
+        """A channel fitted; where nobody has measured what the calibration states, until its priors are weighed by what the fit
+        leaves: by what was left before it, numbers that are far off would hold themselves back."""
+        model = self._fitted(channel)
+        if any(c.unmeasured for c in self.own(channel)):
+            before = self
+            for _ in range(_FITS):
+                if model._variance(channel) > _AS_WEIGHED * before._variance(channel):
+                    break
+                before, model = model, model._fitted(channel)
         return model
 
     def _variance(self, channel: str) -> float:
