@@ -86,11 +86,16 @@ def test_what_a_parameter_may_change_by_is_a_factor_up_or_down_beside_its_sigma(
     ids=["twice", "a motor's behind a gear", "another amplitude", "identified"],
 )
 def test_a_stated_torque_constant_that_no_supplier_states_is_asked_about(value, tolerated, said):
-    """The fit ends between it and what the logs show, as certain of itself as ever."""
+    """Where no load tells it the fit ends between it and what the logs show, as certain of itself as ever."""
     found = Recalibrated(0.5, value, 0.05, "N·m/A", 900.0, "torque", tolerated)
-    text = " ".join(_recalibration(SimpleNamespace(recalibrated={TORQUE_CONSTANT: found})))
-    assert text.startswith("Recalibrated: torque constant 0.5 → ")
-    assert said in text and ("No supplier's torque constant" in text) == bool(said)
+
+    def text(load_follows: bool) -> str:
+        bench = SimpleNamespace(load_follows=load_follows)
+        return " ".join(_recalibration(SimpleNamespace(recalibrated={TORQUE_CONSTANT: found}, bench=bench)))
+
+    assert text(False).startswith("Recalibrated: torque constant 0.5 → ")
+    assert said in text(False) and ("No supplier's torque constant" in text(True)) == bool(said)
+    assert "begin again" not in text(True), "a load that is measured tells the constant"
 
 
 def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):

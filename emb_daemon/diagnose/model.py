@@ -145,8 +145,8 @@ class Model:
         return model
 
     def _weighed(self, channel: str) -> "Model":
-        """A channel fitted; where nobody has measured what the calibration states, until its priors are weighed by what the fit
-        leaves: by what was left before it, numbers that are far off would hold themselves back."""
+        """A channel fitted; where nobody has measured what the calibration states, until its priors are weighed by what the
+        fit leaves: by what was left before it, numbers that are far off would hold themselves back."""
         model = self._fitted(channel)
         if any(c.unmeasured for c in self.own(channel)):
             before = self

@@ -208,10 +208,13 @@ def _other_constant(diagnosis: Diagnosis) -> list[str]:
     ratio = found.value / found.before
     if 1.0 / _OF_A_SUPPLIER < ratio < _OF_A_SUPPLIER:
         return []
-    return [
+    told = (
         f"No supplier's torque constant is off by {ratio:.3g}: is it that of the motor without its gear, or are current, "
-        f"force or gear gain in another unit? The stated one still holds it back: begin again with {found.value:.3g} N·m/A."
-    ]
+        "force or gear gain in another unit?"
+    )
+    if diagnosis.bench.load_follows:
+        return [told]
+    return [f"{told} The stated one still holds it back: begin again with {found.value:.3g} N·m/A."]
 
 
 def _no_tolerance(diagnosis: Diagnosis) -> list[str]:
