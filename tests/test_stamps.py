@@ -1163,3 +1163,46 @@ def test_a_coarse_encoder_hides_no_way():
     counts = np.floor(0.7 * np.arange(400)) + np.random.default_rng(3).integers(-1, 2, 400)
     assert not Series(time_ns, 0.1 * counts).way_is_unknown
     assert Series(time_ns, 0.1 * counts + 1e-5 * np.arange(400)).way_is_unknown
+
+
+def _swings_against(load, way):
+    """A joint that swings against a load, ``load`` of the angle's swing (-1 to 1) and the time: messages to be compared."""
+    time_s = 0.004 * np.arange(6000)
+    # To and fro at constant speed, so that acceleration takes no part.
+    swing = 2.0 / np.pi * np.arcsin(np.sin(1.3 * time_s))
+    force = load(swing, time_s)
+    current = 1e-3 * force + 0.4 * np.sign(np.cos(1.3 * time_s)) + np.random.default_rng(3).normal(0.0, 0.05, 6000)
+    times = (1e9 * time_s).astype(np.int64)
+    values = {"EMB_FL_Resolver": ("MotorAngle", 30.0 * swing), "EMB_FL_Current": ("CurrentQ", current)}
+    values["RIG_FL_Force"] = ("ClampForceRef", way * force)
+    return {message: {name: Series(times, own)} for message, (name, own) in values.items()}
+
+
+def _either_sign(swing, time_s):
+    return 4000.0 * np.sin(0.37 * time_s)
+
+
+def _never_released(swing, time_s):
+    return 6000.0 - 2500.0 * swing
+
+
+def _of_the_time(swing, time_s):
+    return 3500.0 + 3400.0 * np.sin(0.21 * time_s)
+
+
+@pytest.mark.parametrize(
+    ("load", "way", "said"),
+    [
+        (_either_sign, 1.0, ""),
+        (_either_sign, -1.0, "the motor's current bears its load: `scale: -1` of ClampForceRef?"),
+        (_never_released, 1.0, ""),
+        (_never_released, -1.0, "positive current clamps: `scale: -1` of one of the two?"),
+        (_of_the_time, 1.0, ""),
+    ],
+    ids=["right", "sensor turned round", "a joint's weight", "turned round", "another motor's load"],
+)
+def test_a_load_is_asked_about_where_it_opposes_its_current_and_not_because_it_is_no_clamps(load, way, said):
+    """No clamp is under load at both ends of its travel, and none's force is the same there."""
+    told = [line for line in contradictions("FL", _swings_against(load, way)) if "scale: -1" in line]
+    assert (said in told[0] and "ClampForceRef falls while CurrentQ rises" in told[0] if told else False) == bool(said)
+    assert len(told) == bool(said)

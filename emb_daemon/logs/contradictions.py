@@ -127,7 +127,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         # A current that is turned round itself lets friction drive the motor, which has been said.
         return lines if driven or not moves or force is None else lines + _find_opposed(speed, current, force, bare)
     turned = []
-    if current is not None and np.ptp(current.values) and (force is None or _follows(angle, force)):
+    if current is not None and np.ptp(current.values) and (force is None or _may_clamp(angle, force)):
         turned += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
         turned_force = _find_turned_force(angle, force)
@@ -443,18 +443,18 @@ def _find_turned_current(angle: Series, current: Series) -> list[str]:
     return []
 
 
-def _follows(angle: Series, force: Series) -> bool:
-    """Whether a force is another at one end of the travel than at the other, as a clamp's is whichever way it is counted."""
+def _may_clamp(angle: Series, force: Series) -> bool:
+    """Whether a force is another at one end of the travel than at the other, and next to nothing at one of them, as a clamp's
+    is whichever way it is counted."""
     low, high = _by_travel(angle, force)
-    return abs(high - low) >= _FOLLOWS * float(np.quantile(np.abs(force.values), 0.99))
+    largest = float(np.quantile(np.abs(force.values), 0.99))
+    return abs(high - low) >= _FOLLOWS * largest and min(abs(low), abs(high)) <= _OPEN * largest
 
 
 def _find_turned_force(angle: Series, force: Series) -> list[str]:
-    low, high = _by_travel(angle, force)
-    # At one end of the travel a clamp is open.
-    is_open = min(abs(low), abs(high)) <= _OPEN * float(np.quantile(np.abs(force.values), 0.99))
-    if not _follows(angle, force) or not is_open:
+    if not _may_clamp(angle, force):
         return []
+    low, high = _by_travel(angle, force)
     if (reached := np.max(np.abs(force.values))) < _LEAST_CLAMP_N:
         return [f"ClampForceRef reaches {reached:.3g} N, which clamps nothing; is its unit right?"]
     if high < low:
