@@ -681,6 +681,29 @@ def test_lines_of_a_serial_port_that_name_their_values_are_a_table(tmp_path, cap
     assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_a_trace_of_a_plc_is_a_table_of_its_variables(tmp_path, capsys, decimal):
+    """CODESYS and ctrlX write one variable's times and values below the other's; those of a slower task have fewer."""
+    columns = _joint()
+    lines = ["[key]; [value]", "Version; 0x03050000", "BufferEntries; 101"]
+    for number, (name, every) in enumerate((("Axis.fActPosition", 1), ("Axis.fActCurrent", 2), ("Main.iState", 1))):
+        values = (columns["angle_rad"], columns["current_A"], np.ones(2400))[number][::every]
+        lines += [f"{number}.Variable; {name}", f"{number}.Class; 14", f"{number}.Data; "]
+        lines += [
+            f"; {1e3 * t:.3f}; {v:.5f}".replace(".", decimal) for t, v in zip(columns["time_s"][::every], values, strict=True)
+        ]
+    (tmp_path / "axis.trace.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: Time, unit: ms}\nsignals:\n"
+        "  EMB_FL_Resolver.MotorAngle: {signal: Axis.fActPosition, unit: rad}\n"
+        "  EMB_FL_Current.CurrentQ: {signal: Axis.fActCurrent, unit: A, mean_ms: 0}\n"
+    )
+    samples = load_log(tmp_path / "axis.trace.csv", read=Mapping(tmp_path / "m.yaml").read).samples
+    assert "left out" not in capsys.readouterr().err
+    assert len(samples) > 10_000 and np.ptp(samples["angle"]) == pytest.approx(80.0, rel=0.01)
+    assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
+
+
 def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
     time_s = 0.004 * np.arange(1000)
     still = 0.0 * time_s
