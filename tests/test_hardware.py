@@ -14,7 +14,7 @@ from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
 from emb_daemon.calibration.types import Provenance
 from emb_daemon.cli.main import main
-from emb_daemon.diagnose import residuals
+from emb_daemon.diagnose import diagnosis, residuals
 from emb_daemon.diagnose.comparison import errors, whole
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
@@ -242,6 +242,23 @@ def test_what_a_plain_fit_leaves_is_stated_beside_what_was_found(load, validated
     better = dataclasses.replace(found, plain=(0.9 * ours_N, ours_N))
     assert "Plain least squares" in verdict(better) and "Plain least squares" not in verdict(found)
     assert "Plain least squares" not in verdict(dataclasses.replace(found, plain=None))
+
+
+def test_of_each_quarter_of_the_episodes_the_others_are_fitted_plainly(monkeypatch):
+    stated, _, fit, _ = _on_a_dynamometer(scatter=0.9, load=1.0)
+    bench, parts = Bench([fit], stated), []
+
+    def left(fitted, kept, judged, asked):
+        parts.append((kept, asked))
+        return 1.0 * asked
+
+    monkeypatch.setattr(diagnosis, "plain_left", left)
+    monkeypatch.setattr(diagnosis, "left_out_residuals", lambda selection: {"torque": np.ones(len(fit.samples))})
+    selection = SimpleNamespace(model=SimpleNamespace(bench=bench))
+    assert diagnosis._plain(selection, None, {}) == (1.0, 1.0)
+    told = bench.residuals({})["torque"] != 0.0
+    assert len(parts) == 4 and np.array_equal(sum(asked.astype(int) for _, asked in parts), told)
+    assert all(np.array_equal(kept, told & ~asked) for kept, asked in parts)
 
 
 def test_a_plain_fit_knows_nothing_of_what_it_is_judged_by():
