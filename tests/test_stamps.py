@@ -692,6 +692,7 @@ def test_a_trace_of_a_plc_is_a_table_of_its_variables(tmp_path, capsys, decimal)
         lines += [
             f"; {1e3 * t:.3f}; {v:.5f}".replace(".", decimal) for t, v in zip(columns["time_s"][::every], values, strict=True)
         ]
+    lines.insert(900, "; 1.2.3; 4")
     (tmp_path / "axis.trace.csv").write_text("\n".join(lines) + "\n")
     (tmp_path / "m.yaml").write_text(
         "format: 1\ntime: {signal: Time, unit: ms}\nsignals:\n"

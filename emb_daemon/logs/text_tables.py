@@ -32,8 +32,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
 #: A line's end before a separator.
 _LEFT_IN_CELLS = re.compile(rb"\r(?=[,;|\t])")
-#: How a trace of a PLC begins.
-_TRACE = re.compile(rb"\s*\[key\]\s*;\s*\[value\]", re.IGNORECASE)
+#: How a trace of a PLC begins, and a time in it.
+_TRACE, _TIME = re.compile(rb"\s*\[key\]\s*;\s*\[value\]", re.IGNORECASE), re.compile(rb"-?\d+(?:[.,]\d+)?")
 #: A semicolon at the end of a line.
 _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
 #: A name in quotes of a few lines, which begins and ends a cell.
@@ -241,7 +241,7 @@ def _traced(content: bytes) -> bytes:
             names[key.removesuffix(b".Variable")] = cells[0] if cells else b""
         elif key.endswith(b".Data"):
             number = key.removesuffix(b".Data")
-        elif not key and len(cells) == 2 and number in names:
+        elif not key and len(cells) == 2 and number in names and _TIME.fullmatch(cells[0]):
             rows.setdefault(cells[0], {})[number] = cells[1]
     # Variables of several tasks come at times of their own.
     times = sorted(rows, key=lambda time: float(time.replace(b",", b".")))
