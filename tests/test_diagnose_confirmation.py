@@ -86,11 +86,16 @@ def test_what_a_parameter_may_change_by_is_a_factor_up_or_down_beside_its_sigma(
     ids=["twice", "a motor's behind a gear", "another amplitude", "identified"],
 )
 def test_a_stated_torque_constant_that_no_supplier_states_is_asked_about(value, tolerated, said):
-    """The fit ends between it and what the logs show, as certain of itself as ever."""
+    """Where no load tells it the fit ends between it and what the logs show, as certain of itself as ever."""
     found = Recalibrated(0.5, value, 0.05, "N·m/A", 900.0, "torque", tolerated)
-    text = " ".join(_recalibration(SimpleNamespace(recalibrated={TORQUE_CONSTANT: found})))
-    assert text.startswith("Recalibrated: torque constant 0.5 → ")
-    assert said in text and ("No supplier's torque constant" in text) == bool(said)
+
+    def text(load_follows: bool) -> str:
+        bench = SimpleNamespace(load_follows=load_follows)
+        return " ".join(_recalibration(SimpleNamespace(recalibrated={TORQUE_CONSTANT: found}, bench=bench)))
+
+    assert text(False).startswith("Recalibrated: torque constant 0.5 → ")
+    assert said in text(False) and ("No supplier's torque constant" in text(True)) == bool(said)
+    assert "begin again" not in text(True), "a load that is measured tells the constant"
 
 
 def test_what_has_a_name_is_called_by_it(viscous, monkeypatch):
@@ -186,7 +191,7 @@ def test_validation_logs_speak_of_the_whole_estimator_beside_left_out_episodes(v
 
 def test_an_effect_is_judged_on_its_own_path_with_the_contact_held(judged, monkeypatch):
     """What the contact angle learns of the other path is no word on it; what is left of its own on left-out episodes is."""
-    judge_left_out, left_out = confirmation.left_out_errors, confirmation._left_out_residuals
+    judge_left_out, left_out = confirmation.left_out_errors, confirmation.left_out_residuals
 
     def worse_while_learning(selection, without=""):
         errors = judge_left_out(selection, without)
@@ -200,7 +205,7 @@ def test_an_effect_is_judged_on_its_own_path_with_the_contact_held(judged, monke
         found = left_out(selection, without)
         return found | {"torque": found["torque"] * (4.0 if selection.accepted and not without else 1.0)}
 
-    monkeypatch.setattr(confirmation, "_left_out_residuals", worse)
+    monkeypatch.setattr(confirmation, "left_out_residuals", worse)
     refused = next(f for f in judged().findings if f.effect.name == "viscous_friction")
     assert not refused.accepted and "left of the torque path goes from" in refused.reason
 
@@ -381,7 +386,7 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
         near = own_path_N if "wrong" in there else 20.0
         return {"torque": np.where(by_sample < 4, 1000.0, near - 1.0 * ("right" in there))}
 
-    monkeypatch.setattr(confirmation, "_left_out_residuals", residuals)
+    monkeypatch.setattr(confirmation, "left_out_residuals", residuals)
 
     def left_out(chosen, without=""):
         there = {*chosen.suspects} - {without}

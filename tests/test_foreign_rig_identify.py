@@ -3,6 +3,7 @@
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import foreignkit
 import numpy as np
@@ -104,16 +105,8 @@ def test_a_force_that_gives_way_is_no_curve_and_has_a_sigma_for_that(tmp_path, c
     """A dome that collapses and is then pressed flat: the contact is found where it rises for good, and the force before it
     is in sigma, though a force of nothing has no relative error."""
     campaign = foreignkit.write_campaign(tmp_path, curve=_low())
-    time_s = 0.01 * np.arange(4000)
-    angle = 4.0 * (1.0 - np.cos(np.pi * time_s / 10.0)) * (time_s < 20.0)
-    given = [0.0, 3.8, 5.0, 4.6, 2.4, 1.9, 2.7, 12.0]
-    force = 1000.0 * pchip_interpolate([0.0, 1.0, 2.0, 3.2, 5.0, 6.0, 7.2, 8.0], given, angle)
-    foreignkit.write_table(
-        tmp_path / "curve.parquet", {"time_s": time_s, "angle_rad": angle, "force_N": force, "plate_C": 22.0 + 0.0 * time_s}
-    )
+    _dome(tmp_path, "curve.parquet")
     mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
-    lines = mapping.read_text().splitlines(keepends=True)
-    mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
     fit, fits = stiffness.identify, []
     monkeypatch.setattr(stiffness, "identify", lambda *of: (fits or fits.append(fit(*of)) or fits)[0])
     main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
@@ -130,6 +123,53 @@ def test_a_force_that_gives_way_is_no_curve_and_has_a_sigma_for_that(tmp_path, c
     _overconfident(monkeypatch)
     main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
     assert "curve.parquet, which was fitted: " in (told := capsys.readouterr().err) and "worse than it says" in told
+
+
+def _dome(tmp_path, *names: str) -> None:
+    """A dome that collapses and is then pressed flat, recorded once for each of the tables named."""
+    time_s = 0.01 * np.arange(4000)
+    angle = 4.0 * (1.0 - np.cos(np.pi * time_s / 10.0)) * (time_s < 20.0)
+    given = [0.0, 3.8, 5.0, 4.6, 2.4, 1.9, 2.7, 12.0]
+    force = 1000.0 * pchip_interpolate([0.0, 1.0, 2.0, 3.2, 5.0, 6.0, 7.2, 8.0], given, angle)
+    columns = {"time_s": time_s, "angle_rad": angle, "force_N": force, "plate_C": 22.0 + 0.0 * time_s}
+    for name in names:
+        foreignkit.write_table(tmp_path / name, columns)
+    mapping = tmp_path / "mapping.yaml"
+    lines = mapping.read_text().splitlines(keepends=True)
+    mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
+
+
+def test_a_curve_that_predicts_less_than_a_plain_cubic_is_said(tmp_path, capsys):
+    """Of two logs each is predicted from the other: of a dome much worse than a cubic does."""
+    campaign = foreignkit.write_campaign(tmp_path, curve_1=_low(), curve_2=_low())
+    _dome(tmp_path, "curve_1.parquet", "curve_2.parquet")
+    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
+    main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
+    said = "curves: a cubic of the angle for each way, fitted to the other slow logs, leaves "
+    line = next(line for line in capsys.readouterr().err.splitlines() if line.startswith(said))
+    cubic_N, ours_N = (float(number) for number in re.findall(r"([\d.e+]+) N\b", line))
+    assert ours_N > 1.5 * cubic_N > 300.0
+
+
+@pytest.mark.parametrize(("plain_N", "said"), [(None, False), (80.0, True), (97.0, False), (200.0, False)])
+def test_a_cubic_that_predicts_as_well_says_nothing(plain_N, said):
+    step = SimpleNamespace(chosen=SimpleNamespace(held_out_rmse=100.0), plain_N=plain_N)
+    assert bool(stiffness.StiffnessStep.plainly_better.fget(step)) == said
+
+
+def test_a_plain_cubic_is_fitted_to_the_logs_that_it_is_not_judged_on():
+    time_s = 0.01 * np.arange(2000)
+    angle = 4.0 * (1.0 - np.cos(np.pi * time_s / 10.0))
+
+    def log(force_N):
+        return emb_daemon.log_of_arrays(time_s, angle, force_N=force_N, wheel_speed_rad_per_s=0.0)
+
+    force = 20.0 * angle**2 + 300.0 * np.sign(np.gradient(angle))
+    alike, other = ([log(force + more) for more in (0.0, 0.0, third)] for third in (0.0, 300.0))
+    left = [stiffness._plain([stiffness.Pads(10.0, tuple(logs))]) for logs in (alike, other)]
+    assert left[0] < 25.0, "where it turns back the way of a sample is unsure"
+    # The third is predicted from the others, and each of these from one that is alike and one that is not.
+    assert left[1] == pytest.approx(np.sqrt((300.0**2 + 2.0 * 150.0**2) / 3.0), rel=0.05)
 
 
 def test_an_angle_the_wrong_way_round_is_told(tmp_path, capsys):

@@ -1,5 +1,6 @@
 """Machines that nobody here built: an actuator without pads, sensors without noise, and the converters of measured sets."""
 
+import dataclasses
 import re
 from types import SimpleNamespace
 
@@ -13,13 +14,16 @@ from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
 from emb_daemon.calibration.types import Provenance
 from emb_daemon.cli.main import main
-from emb_daemon.diagnose import residuals
+from emb_daemon.diagnose import diagnosis, residuals
 from emb_daemon.diagnose.comparison import errors, whole
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.model import Model
+from emb_daemon.diagnose.plain import plain_left, plain_rms
+from emb_daemon.diagnose.report import report
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Screening
 from emb_daemon.diagnose.speeds import denoised
+from emb_daemon.diagnose.text import verdict
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.logs import resample
 from emb_daemon.offline import load_log
@@ -204,6 +208,69 @@ def test_a_constant_is_free_as_far_as_a_supplier_leaves_it_unless_it_was_measure
         priors += [c.prior for c in Model.of(bench).values if c.name == TORQUE_CONSTANT]
     free, measured, untold = priors
     assert free == pytest.approx(10.0 * measured) and untold == measured
+
+
+@pytest.mark.parametrize("stated_as", [0.2, 1.0, 4.0])
+def test_a_constant_that_is_stated_far_off_does_not_hold_the_fit_half_way(stated_as):
+    """That of the motor without its gear, for example: the friction that it lets begin with is off by as much."""
+    stated, constant, fit, _ = _on_a_dynamometer(scatter=0.9, load=1.0)
+    guess = moved(stated, {TORQUE_CONSTANT: stated_as * constant, "friction.offset_Nm": 0.1 * stated.friction.offset_Nm})
+    bench = Bench([fit], guess)
+    found = bench.calibrated(Model.of(bench).refined(["torque"]).values)
+    assert found.motor.torque_constant_Nm_per_A == pytest.approx(constant, rel=0.05)
+    assert found.friction.offset_Nm == pytest.approx(stated.friction.offset_Nm, rel=0.3)
+
+
+def test_logs_that_judge_are_judged_by_what_is_fitted():
+    """Though by themselves they would be judged otherwise: errors of another quantity refute nothing."""
+    stated, _, fit, _ = _on_a_dynamometer(scatter=0.9, load=1.0)
+    _, _, judge, _ = _on_a_dynamometer(scatter=0.9, load=0.1)
+    assert Bench([fit], stated).load_follows and not Bench([judge], stated).load_follows
+    assert diagnose([fit], stated, [judge]).judges.load_follows
+
+
+@pytest.mark.parametrize(("load", "validated"), [(1.0, True), (1.0, False), (0.1, True)])
+def test_what_a_plain_fit_leaves_is_stated_beside_what_was_found(load, validated):
+    """Where friction scatters and nothing else is there to be found, both leave the same."""
+    stated, _, fit, judge = _on_a_dynamometer(scatter=0.9, load=load)
+    found = diagnose([fit], stated, [judge] if validated else [])
+    plain_N, ours_N = found.plain
+    assert plain_N == pytest.approx(ours_N, rel=0.1) and not found.plainly_better
+    if load == 1.0:
+        assert ours_N == pytest.approx(found.after.rmse("torque"), rel=0.02)
+    assert report(found)["plain"] == {"rms_plain_N": plain_N, "rms_after_N": ours_N}
+    better = dataclasses.replace(found, plain=(0.9 * ours_N, ours_N))
+    assert "Plain least squares" in verdict(better) and "Plain least squares" not in verdict(found)
+    assert "Plain least squares" not in verdict(dataclasses.replace(found, plain=None))
+
+
+def test_of_each_quarter_of_the_episodes_the_others_are_fitted_plainly(monkeypatch):
+    stated, _, fit, _ = _on_a_dynamometer(scatter=0.9, load=1.0)
+    bench, parts = Bench([fit], stated), []
+
+    def left(fitted, kept, judged, asked):
+        parts.append((kept, asked))
+        return 1.0 * asked
+
+    monkeypatch.setattr(diagnosis, "plain_left", left)
+    monkeypatch.setattr(diagnosis, "left_out_residuals", lambda selection: {"torque": np.ones(len(fit.samples))})
+    selection = SimpleNamespace(model=SimpleNamespace(bench=bench))
+    assert diagnosis._plain(selection, None, {}) == (1.0, 1.0)
+    told = bench.residuals({})["torque"] != 0.0
+    assert len(parts) == 4 and np.array_equal(sum(asked.astype(int) for _, asked in parts), told)
+    assert all(np.array_equal(kept, told & ~asked) for kept, asked in parts)
+
+
+def test_a_plain_fit_knows_nothing_of_what_it_is_judged_by():
+    stated, _, fit, judge = _on_a_dynamometer(scatter=0.9, load=1.0)
+    fitted, judges = Bench([fit], stated), Bench([judge], stated)
+    every = [np.ones(len(log.samples), bool) for log in (fit, judge)]
+    first = plain_left(fitted, every[0], judges, every[1])
+    few = every[0] & (np.arange(len(fit.samples)) < 500)
+    assert np.std(plain_left(fitted, few, judges, every[1]) - first) > 0.01 * np.std(first)
+    asked = np.arange(len(judge.samples)) % 2 == 0
+    assert np.array_equal(plain_left(fitted, every[0], judges, asked), np.where(asked, first, 0.0))
+    assert plain_rms(np.array([3.0, 0.0, -3.0])) == 3.0
 
 
 @pytest.mark.parametrize("validated", [False, True])

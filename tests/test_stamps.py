@@ -681,6 +681,30 @@ def test_lines_of_a_serial_port_that_name_their_values_are_a_table(tmp_path, cap
     assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_a_trace_of_a_plc_is_a_table_of_its_variables(tmp_path, capsys, decimal):
+    """CODESYS and ctrlX write one variable's times and values below the other's; those of a slower task have fewer."""
+    columns = _joint()
+    lines = ["[key]; [value]", "Version; 0x03050000", "BufferEntries; 101"]
+    for number, (name, every) in enumerate((("Axis.fActPosition", 1), ("Axis.fActCurrent", 2), ("Main.iState", 1))):
+        values = (columns["angle_rad"], columns["current_A"], np.ones(2400))[number][::every]
+        lines += [f"{number}.Variable; {name}", f"{number}.Class; 14", f"{number}.Data; "]
+        lines += [
+            f"; {1e3 * t:.3f}; {v:.5f}".replace(".", decimal) for t, v in zip(columns["time_s"][::every], values, strict=True)
+        ]
+    lines.insert(900, "; 1.2.3; 4")
+    (tmp_path / "axis.trace.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: Time, unit: ms}\nsignals:\n"
+        "  EMB_FL_Resolver.MotorAngle: {signal: Axis.fActPosition, unit: rad}\n"
+        "  EMB_FL_Current.CurrentQ: {signal: Axis.fActCurrent, unit: A, mean_ms: 0}\n"
+    )
+    samples = load_log(tmp_path / "axis.trace.csv", read=Mapping(tmp_path / "m.yaml").read).samples
+    assert "left out" not in capsys.readouterr().err
+    assert len(samples) > 10_000 and np.ptp(samples["angle"]) == pytest.approx(80.0, rel=0.01)
+    assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
+
+
 def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
     time_s = 0.004 * np.arange(1000)
     still = 0.0 * time_s
@@ -1036,7 +1060,7 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, of_current, sa
     columns |= {"force_N": force, "plate_C": 22.0 + 0.0 * time_s}
     _read(tmp_path, columns, foreignkit.COLUMNS if load else free)
     told = capsys.readouterr().err
-    assert said in told and ("scale: -1" in told) == bool(said)
+    assert said in told and told.count("scale: -1") == bool(said)
 
 
 @pytest.mark.parametrize(
@@ -1163,3 +1187,46 @@ def test_a_coarse_encoder_hides_no_way():
     counts = np.floor(0.7 * np.arange(400)) + np.random.default_rng(3).integers(-1, 2, 400)
     assert not Series(time_ns, 0.1 * counts).way_is_unknown
     assert Series(time_ns, 0.1 * counts + 1e-5 * np.arange(400)).way_is_unknown
+
+
+def _swings_against(load, way):
+    """A joint that swings against a load, ``load`` of the angle's swing (-1 to 1) and the time: messages to be compared."""
+    time_s = 0.004 * np.arange(6000)
+    # To and fro at constant speed, so that acceleration takes no part.
+    swing = 2.0 / np.pi * np.arcsin(np.sin(1.3 * time_s))
+    force = load(swing, time_s)
+    current = 1e-3 * force + 0.4 * np.sign(np.cos(1.3 * time_s)) + np.random.default_rng(3).normal(0.0, 0.05, 6000)
+    times = (1e9 * time_s).astype(np.int64)
+    values = {"EMB_FL_Resolver": ("MotorAngle", 30.0 * swing), "EMB_FL_Current": ("CurrentQ", current)}
+    values["RIG_FL_Force"] = ("ClampForceRef", way * force)
+    return {message: {name: Series(times, own)} for message, (name, own) in values.items()}
+
+
+def _either_sign(swing, time_s):
+    return 4000.0 * np.sin(0.37 * time_s)
+
+
+def _never_released(swing, time_s):
+    return 6000.0 - 2500.0 * swing
+
+
+def _of_the_time(swing, time_s):
+    return 3500.0 + 3400.0 * np.sin(0.21 * time_s)
+
+
+@pytest.mark.parametrize(
+    ("load", "way", "said"),
+    [
+        (_either_sign, 1.0, ""),
+        (_either_sign, -1.0, "the motor's current bears its load: `scale: -1` of ClampForceRef?"),
+        (_never_released, 1.0, ""),
+        (_never_released, -1.0, "positive current clamps: `scale: -1` of one of the two?"),
+        (_of_the_time, 1.0, ""),
+    ],
+    ids=["right", "sensor turned round", "a joint's weight", "turned round", "another motor's load"],
+)
+def test_a_load_is_asked_about_where_it_opposes_its_current_and_not_because_it_is_no_clamps(load, way, said):
+    """No clamp is under load at both ends of its travel, and none's force is the same there."""
+    told = [line for line in contradictions("FL", _swings_against(load, way)) if "scale: -1" in line]
+    assert (said in told[0] and "ClampForceRef falls while CurrentQ rises" in told[0] if told else False) == bool(said)
+    assert len(told) == bool(said)

@@ -54,7 +54,7 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
 
 def _left(selection: Selection, judges: Bench | None) -> dict[str, float]:
     """Mean square by force path, N², of what is left of left-out episodes and validation logs."""
-    parts = [_left_out_residuals(selection)]
+    parts = [left_out_residuals(selection)]
     if judges:
         parts.append(judges.under(selection.model.bench.calibrated(selection.applied())).residuals({}))
     there = [c for c in FORCE_CHANNELS if all(c in part for part in parts)]
@@ -158,7 +158,7 @@ def _guilty(selection: Selection, there: np.ndarray) -> list[str]:
     weight = np.sqrt(there)[selection.model.bench.sample_episode]
 
     def left(without: str) -> dict[str, float]:
-        return _sizes({c: r * weight for c, r in _left_out_residuals(selection, without).items() if c in FORCE_CHANNELS})
+        return _sizes({c: r * weight for c, r in left_out_residuals(selection, without).items() if c in FORCE_CHANNELS})
 
     with_all = left("")
     channel = {suspect: selection.channel_of(suspect) for suspect in selection.suspects}
@@ -179,12 +179,12 @@ def _sizes(residual: Mapping[str, np.ndarray]) -> dict[str, float]:
 def _own_harm(selection: Selection, before: Mapping[str, np.ndarray]) -> tuple[str, str] | None:
     """Of a path whose residual on left-out episodes has not fallen, or has clearly risen on one log: the suspect without which
     least is left, with the reason in words; ``before``: residuals by channel, N."""
-    after = _left_out_residuals(selection)
+    after = left_out_residuals(selection)
     for channel in sorted(selection.touched & set(FORCE_CHANNELS)):
         if worse := _where_worse(selection, channel, before[channel], after[channel]):
             rows, told = worse
             own = [suspect for suspect in selection.suspects if selection.channel_of(suspect) == channel]
-            rest = {suspect: rmse(_left_out_residuals(selection, suspect)[channel][rows]) for suspect in own}
+            rest = {suspect: rmse(left_out_residuals(selection, suspect)[channel][rows]) for suspect in own}
             return min(rest, key=rest.__getitem__), f"{told} on left-out episodes"
     return None
 
@@ -208,19 +208,25 @@ def _where_worse(selection: Selection, channel: str, before: np.ndarray, after: 
     return bench.rows[worst], f"what is left of the {channel} path on {name} goes from {first:.4g} to {last:.4g} N"
 
 
+def quarters(bench: Bench) -> list[np.ndarray]:
+    """Masks of the episodes that are left out together, shape (episodes,) each.
+
+    Episodes are dealt at random: dealt in turn, a manoeuvre that repeats could have one of its phases in one part only."""
+    fold = np.random.default_rng(0).permutation(np.arange(bench.episodes) % _FOLDS)
+    return [fold == number for number in range(_FOLDS)]
+
+
 def _fits_without(selection: Selection, without: str) -> Iterator[tuple[np.ndarray, dict[Coordinate, float]]]:
     """Each quarter of the episodes as a mask, shape (episodes,), with the parameters that the other quarters give."""
     bench = selection.model.bench
-    # Episodes are dealt at random: dealt in turn, a manoeuvre that repeats could have one of its phases in one part only.
-    fold = np.random.default_rng(0).permutation(np.arange(bench.episodes) % _FOLDS)
-    for number in range(_FOLDS):
+    for own in quarters(bench):
         values = selection.applied(without)
         for channel in bench.channels:
-            values |= refit(selection, channel, fold != number, without)
-        yield fold == number, values
+            values |= refit(selection, channel, ~own, without)
+        yield own, values
 
 
-def _left_out_residuals(selection: Selection, without: str = "") -> dict[str, np.ndarray]:
+def left_out_residuals(selection: Selection, without: str = "") -> dict[str, np.ndarray]:
     """Residuals by channel of each quarter of the episodes with parameters that the other quarters gave."""
     bench, result = selection.model.bench, {}
     for own, values in _fits_without(selection, without):

@@ -46,6 +46,7 @@ class Coordinate:
         start: its value as calibrated; zero for an effect that is off.
         step: of the numerical derivative.
         prior: standard deviation of what is known beforehand, about the start; infinite for a new effect's amplitude.
+        unmeasured: whether what is known beforehand was only stated, and may be of another unit or place (`known_to`).
         moves: keys that follow it. Several coordinates of one key add up.
         effect, parameter: what it belongs to; empty for a base parameter.
         log: index of the only log that it acts on, or None for all.
@@ -63,6 +64,15 @@ class Coordinate:
     effect: str = ""
     parameter: str = ""
     log: int | None = None
+    unmeasured: bool = False
+
+    def known_to(self, value: float, centre: float | None = None) -> float:
+        """Standard deviation of what is known beforehand, as it weighs on a fit at ``value``; ``centre``: where not the start.
+
+        What nobody has measured is right within ``prior`` or anything: far from it each power of ten is as likely as another
+        (Jeffreys), so that its pull falls with the distance, and a fit does not end half way to what the data say."""
+        away = value - (self.start if centre is None else centre)
+        return float(np.hypot(self.prior, away)) if self.unmeasured else self.prior
 
     def sigma_of(self, value: float, sigma: float) -> float:
         """Standard deviation of a fitted value: one at a bound of what is searched is known no better than it has moved."""
@@ -163,10 +173,12 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
         # No log has shown the history's time constant yet.
         result.append(scaled_coordinate(calibration, [HISTORY_TIME], "stiffness", 1.0))
     for key, channel, prior in _BASE:
-        coordinate = scaled_coordinate(calibration, [key], channel, _STATED if stated and key == TORQUE_CONSTANT else prior)
+        coordinate = scaled_coordinate(calibration, [key], channel, prior)
+        if stated and key == TORQUE_CONSTANT:
+            coordinate = replace(scaled_coordinate(calibration, [key], channel, _STATED), unmeasured=True)
         if key in _LEAST_OF_ANY and not calibration.contact.is_in_reach:
             known = max(_GUESSED * coordinate.start, coordinate.prior)
-            coordinate = replace(coordinate, prior=known, low=_LEAST_OF_ANY[key] * coordinate.start)
+            coordinate = replace(coordinate, prior=known, low=_LEAST_OF_ANY[key] * coordinate.start, unmeasured=True)
         result.append(coordinate)
     return result + _friction(calibration)
 

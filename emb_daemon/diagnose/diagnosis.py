@@ -16,11 +16,12 @@ from emb_daemon.calibration.files import date_of_today
 from emb_daemon.calibration.parameters import moved, parameter, value_of
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
-from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, validation_gains
+from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, left_out_residuals, quarters, validation_gains
 from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.late_reference import may_be_late, reference_late_s
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
+from emb_daemon.diagnose.plain import plain_left, plain_rms
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
@@ -87,6 +88,8 @@ class Diagnosis:
         left: what is left, by channel.
         withdrawn: names of what the fit logs prove and confirmation took out again.
         outside: where the validation logs leave the range in which a term was found.
+        plain: RMS (N) that a plain fit to the same logs (`plain`) leaves of the torque path where it is judged, and that this
+            calibration leaves there; None of a brake, and where no current was recorded.
         reference_late_s: time by which the reference force came after angle and current, before it was judged at its own.
     """
 
@@ -105,6 +108,7 @@ class Diagnosis:
     withdrawn: tuple[str, ...]
     outside: Sequence[Outside]
     seconds: float
+    plain: tuple[float, float] | None = None
     reference_late_s: float = 0.0
 
     @property
@@ -124,6 +128,11 @@ class Diagnosis:
         pairs = (by_log(self.judges, judged, self.whole).tolist() for judged in (self.before, self.after))
         every = zip(self.judges.sources, *pairs, strict=True)
         return [(name, first, last) for name, first, last in every if last > HARM * first]
+
+    @property
+    def plainly_better(self) -> tuple[float, float] | None:
+        """What a plain fit leaves (N), and this calibration, if the plain fit is clearly better."""
+        return self.plain if self.plain and self.plain[1] > HARM * self.plain[0] else None
 
     @property
     def refused(self) -> dict[str, tuple[float, str]]:
@@ -171,14 +180,15 @@ def diagnose(
             "effect from chance"
         )
         raise InputError(f"{fit_logs[0].path}: {told}")
-    judges = Bench(validate, calibration) if validate else None
+    judges = _judges(validate, bench)
     for judging in filter(None, (bench, judges)):
         _refuse_silent(judging)
     late_s = reference_late_s(bench)
     for again in (True, False):
         if late_s:
-            told = ([log.with_reference_earlier(late_s) for log in logs] for logs in (fit_logs, validate))
-            bench, judges = (Bench(logs, calibration) if logs else None for logs in told)
+            earlier, others = ([log.with_reference_earlier(late_s) for log in logs] for logs in (fit_logs, validate))
+            bench = Bench(earlier, calibration)
+            judges = _judges(others, bench)
         result = diagnose_bench(bench, judges, progress)
         # What was found may have hidden that the reference is later still.
         later_s = _later_s(result) if again else 0.0
@@ -242,10 +252,34 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         left=_left(selection, chosen, judged_before, final, judging, augmented),
         withdrawn=tuple(name for name in chosen.accepted if name not in selection.accepted),
         outside=outside_range(judges.under(augmented), made) if judges else (),
+        plain=_plain(selection, judges, final),
         seconds=time.monotonic() - begin,
     )
     progress("done", 1.0)
     return result
+
+
+def _judges(validate: Sequence[Log], bench: Bench) -> Bench | None:
+    """The validation logs, if there are any, judged by the same as those of ``bench`` are fitted by."""
+    return Bench(validate, bench.calibration, load_follows=bench.load_follows) if validate else None
+
+
+def _plain(selection: Selection, judges: Bench | None, final: Mapping[str, np.ndarray]) -> tuple[float, float] | None:
+    """`Diagnosis.plain`: on the validation logs, of which ``final`` are the residuals, or on each quarter of the episodes by a
+    fit to the others."""
+    bench = selection.model.bench
+    if bench.clamps or "torque" not in bench.channels:
+        return None
+    told = bench.residuals({})["torque"] != 0.0
+    if judges:
+        ours = final["torque"]
+        return plain_rms(plain_left(bench, told, judges, ours != 0.0)), rms_known(ours)
+    ours = left_out_residuals(selection)["torque"]
+    left = np.zeros_like(ours)
+    for own in quarters(bench):
+        rows = own[bench.sample_episode]
+        left += plain_left(bench, told & ~rows, bench, told & rows & (ours != 0.0))
+    return plain_rms(left), rms_known(ours)
 
 
 def _refuse_same(fit_logs: Sequence[Log], validate: Sequence[Log]) -> None:

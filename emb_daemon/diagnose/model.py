@@ -19,6 +19,8 @@ _INFLATION = 5.0
 TOLERANCE, _EVALUATIONS = 2e-3, 8
 #: Fits one after the other until one gains next to nothing.
 _FITS = 8
+#: Share of the variance by which priors were weighed that a fit must leave, or they counted too much.
+_AS_WEIGHED = 0.9
 #: Heat and force that rest on each other are fitted in turn so often at most, until a turn leaves this share of the force's
 #: mean square, and of the temperatures' or these are right within the standard deviation of a thermocouple (IEC 60584, class
 #: 1), K.
@@ -139,8 +141,24 @@ class Model:
         model, channels = self, set(channels)
         for channel in (*HEAT_CHANNELS, *FORCE_CHANNELS):
             if channel in channels and model.own(channel):
-                model = model._fitted(channel)
+                model = model._weighed(channel)
         return model
+
+    def _weighed(self, channel: str) -> "Model":
+        """A channel fitted; where nobody has measured what the calibration states, until its priors are weighed by what the
+        fit leaves: by what was left before it, numbers that are far off would hold themselves back."""
+        model = self._fitted(channel)
+        if any(c.unmeasured for c in self.own(channel)):
+            before = self
+            for _ in range(_FITS):
+                if model._variance(channel) > _AS_WEIGHED * before._variance(channel):
+                    break
+                before, model = model, model._fitted(channel)
+        return model
+
+    def _variance(self, channel: str) -> float:
+        """Of the sum that one independent observation makes, in the square of the channel's unit."""
+        return self.inflation(channel) * max(self.noise(channel), 1e-12)
 
     def arrived(self, channel: str) -> "Model":
         """A channel fitted until nothing is gained: from far away one fit does not arrive."""
@@ -170,7 +188,7 @@ class Model:
     def _fitted(self, channel: str) -> "Model":
         own, episode = tuple(self.own(channel)), self.bench.episode[channel]
         # In units in which an independent observation has variance one, as priors have.
-        scale = float(np.sqrt(self.inflation(channel) * max(self.noise(channel), 1e-12)))
+        scale = float(np.sqrt(self._variance(channel)))
         start = tuple(self.values[c] for c in own)
         bench, values, heat = self.stood.get(channel, (None, None, None))
         as_left = bench is self.bench and values == self.values and heat is self.heat
@@ -207,7 +225,7 @@ class Model:
         def derivative(tried: Values) -> np.ndarray:
             return columns(tried) / -scale
 
-        prior = {c: (self.centre.get(c, c.start), c.prior) if np.isfinite(c.prior) else None for c in own}
+        prior = {c: (self.centre.get(c, c.start), self._known_to(c)) if np.isfinite(c.prior) else None for c in own}
         free = {c: Free(self.values[c], c.step, c.low, c.high, prior[c]) for c in own}
         found = fit([Block(residual, own, episode, derivative)], free, tolerance=TOLERANCE, evaluations=_EVALUATIONS)
         ended = tuple(found.values[c] for c in own)
@@ -223,12 +241,16 @@ class Model:
             fits={**self.fits, channel: found},
         )
 
+    def _known_to(self, coordinate: Coordinate) -> float:
+        centre = self.centre.get(coordinate, coordinate.start)
+        return coordinate.known_to(self.values.get(coordinate, centre), centre)
+
     # -- testing ------------------------------------------------------------------------------------------------------
 
     def penalty(self, coordinates: Sequence[Coordinate], channel: str) -> np.ndarray:
         """What priors add to the normal equations."""
-        prior = np.array([c.prior for c in coordinates])
-        return self.inflation(channel) * max(self.noise(channel), 1e-12) / prior**2
+        prior = np.array([self._known_to(c) for c in coordinates])
+        return self._variance(channel) / prior**2
 
     def moments(
         self, channel: str, columns: Sequence[np.ndarray], residual: np.ndarray | None = None, samples: int = 1

@@ -262,9 +262,11 @@ class Bench:
         mounted: Sequence[Mapping[str, float]] = (),
         own_data: bool = False,
         workers: int = 2,
+        load_follows: bool | None = None,
     ):
         """``mounted``: for each log what the calibration says otherwise of it alone (`Trial.mounted`). ``own_data``:
-        the calibration was fitted to these logs. Heat is settled then: it must not make up for a force that is off yet."""
+        the calibration was fitted to these logs. Heat is settled then: it must not make up for a force that is off yet.
+        ``load_follows``: as the logs say with which these are compared; as they say themselves, if it is not given."""
         self.calibration = calibration
         self.own_data = own_data
         self.straight: bool = True
@@ -293,7 +295,7 @@ class Bench:
         self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
-        self.load_follows: bool = self.has_reference and not self.clamps and _partial_correlation(self.trials) > _FOR_THE_LOAD
+        self.load_follows: bool = self._load_follows() if load_follows is None else load_follows
         #: Whether the load is known to be nothing: then the current itself is all that is explained.
         self.turns_free: bool = self.has_reference and not self.clamps and not np.any(self.load_N)
         if not self.clamps and not self.load_follows:
@@ -301,6 +303,9 @@ class Bench:
                 trial.log = replace(trial.log, samples=denoised(trial.log.samples, self.turns_free))
         #: Converts unexplained current to force: what it would be on the spindle.
         self.newton_per_ampere: float = calibration.motor.torque_constant_Nm_per_A / calibration.motor.gear_gain_m_per_rad
+
+    def _load_follows(self) -> bool:
+        return self.has_reference and not self.clamps and _partial_correlation(self.trials) > _FOR_THE_LOAD
 
     def _trial(self, index: int, log: Log, mounted: Mapping[str, float]) -> Trial:
         return make_trial(log, index, held(to_parameters(moved(self.calibration, {**mounted, **self.told})))[0], mounted)

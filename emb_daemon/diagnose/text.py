@@ -107,7 +107,7 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    parts = (_worse, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    parts = (_worse, _plain, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
 
@@ -115,6 +115,17 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
     """Logs that have lost by what was found, whatever the others gain."""
     logs = [f"{log} ({before:.1f} N → {after:.1f} N)" for log, before, after in diagnosis.worse]
     return [f"Worse on {', '.join(logs)}."] if logs else []
+
+
+def _plain(diagnosis: Diagnosis) -> list[str]:
+    """A plain fit is better than what was found: the calibration is not as good as the logs allow."""
+    if not diagnosis.plainly_better:
+        return []
+    plain_N, ours_N = diagnosis.plainly_better
+    return [
+        "Plain least squares with constant, offset, Coulomb and viscous friction, fitted to the same logs, leave "
+        f"{plain_N:.4g} N of the torque path, and this calibration {ours_N:.4g} N: it is not as good as these logs allow."
+    ]
 
 
 def _late(diagnosis: Diagnosis) -> list[str]:
@@ -199,10 +210,13 @@ def _other_constant(diagnosis: Diagnosis) -> list[str]:
     ratio = found.value / found.before
     if 1.0 / _OF_A_SUPPLIER < ratio < _OF_A_SUPPLIER:
         return []
-    return [
+    told = (
         f"No supplier's torque constant is off by {ratio:.3g}: is it that of the motor without its gear, or are current, "
-        f"force or gear gain in another unit? The stated one still holds it back: begin again with {found.value:.3g} N·m/A."
-    ]
+        "force or gear gain in another unit?"
+    )
+    if diagnosis.bench.load_follows:
+        return [told]
+    return [f"{told} The stated one still holds it back: begin again with {found.value:.3g} N·m/A."]
 
 
 def _no_tolerance(diagnosis: Diagnosis) -> list[str]:

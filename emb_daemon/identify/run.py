@@ -75,6 +75,8 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
             f"The reference force comes {1e3 * late_s:.1f} ms after the resolver: all logs are judged with it at its own time."
         )
         stiff = replaced(stiffness.identify(pads, start), notes=(note,))
+    if stiff.plainly_better:
+        campaign.fault(f"curves: {stiff.plainly_better}")
     progress(0.3, "torque path")
     motor = torque.identify(campaign, pads, start)
     zero = contact.identify(stiff, sheet.resolver.count_rad, start.contact.clearance_rad)

@@ -31,8 +31,8 @@ _GAP_S, _GAP_PERIODS = 0.1, 10.0
 _TRAVEL_RAD = 1.0
 #: Correlation of angle and acceleration up to which their parts of the current can be separated.
 _TOLD_APART = 0.5
-#: Least change of the force over the travel, as a share of the largest.
-_FOLLOWS = 0.2
+#: Least change of the force over the travel, and most of it where a clamp is open, or next to it, as shares of the largest.
+_FOLLOWS, _OPEN = 0.2, 0.2
 #: Shares of the travel up to which a motor stands and from which on a clamp has begun, least number of samples between them,
 #: and how alike an open brake's force is meanwhile, as a share of its range: a clamp that begins in contact has a slope there.
 #: Least share of the range that is no zero error of a tared load cell's.
@@ -111,8 +111,10 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         # One number, however many times a column has it.
         stated, force = messages[f"RIG_{corner}_Force"]["ClampForceRef"], None
         load = float(stated.values[0]) if isinstance(stated, Series) else stated
+    driven: list[str] = []
     if speed is not None and current is not None and load is not None and (moves or (bare and speed.is_resolved)):
-        lines += find_driving_friction(speed, current, load)
+        driven = find_driving_friction(speed, current, load)
+        lines += driven
     if moves and load is not None:
         lines += find_other_current(speed, current, load)
         # What relaxes in pads looks like a delay.
@@ -122,11 +124,18 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
         turned = [] if angle is None or bare or force is None or not np.ptp(force.values) else _find_turned_force(angle, force)
         return lines + (turned or _find_opposed(speed, current, force) if moves and force is not None else turned)
     if bare:
-        return lines
-    if current is not None and np.ptp(current.values):
-        lines += _find_turned_current(angle, current)
+        # A current that is turned round itself lets friction drive the motor, which has been said.
+        return lines if driven or not moves or force is None else lines + _find_opposed(speed, current, force, bare)
+    turned = []
+    if current is not None and np.ptp(current.values) and (force is None or _may_clamp(angle, force)):
+        turned += _find_turned_current(angle, current)
     if force is not None and np.ptp(force.values):
-        lines += _find_turned_force(angle, force) or [*_find_untared(angle, force), *_find_late_force(angle, force)]
+        turned_force = _find_turned_force(angle, force)
+        turned += turned_force
+        lines += [] if turned_force else [*_find_untared(angle, force), *_find_late_force(angle, force)]
+    if moves and force is not None and not turned:
+        turned = _find_opposed(speed, current, force)
+    lines += turned
     return lines
 
 
@@ -338,8 +347,9 @@ def _turn_as(jump: float) -> str:
     return ""
 
 
-def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
-    """A line if the force falls whenever the current without acceleration rises."""
+def _find_opposed(speed: Series, current: Series, force: Series, bare: bool = False) -> list[str]:
+    """A line if the force falls whenever the current without acceleration rises; ``bare`` of what clamps nothing, whose
+    current and motion agree."""
     times = current.time_ns
     at, acceleration = force.sampled(times), np.gradient(speed.sampled(times), 1e-9 * times)
     known = np.isfinite(at) & np.isfinite(acceleration)
@@ -349,10 +359,9 @@ def _find_opposed(speed: Series, current: Series, force: Series) -> list[str]:
     correlation = float(np.corrcoef(left, at[known])[0, 1]) if left is not None and np.ptp(left) else 0.0
     if correlation > -AGAINST:
         return []
-    return [
-        f"ClampForceRef falls while CurrentQ rises (correlation {correlation:.2f}), and positive current clamps: "
-        "`scale: -1` of one of the two?"
-    ]
+    why = "and the motor's current bears its load" if bare else "and positive current clamps"
+    which = "ClampForceRef" if bare else "one of the two"
+    return [f"ClampForceRef falls while CurrentQ rises (correlation {correlation:.2f}), {why}: `scale: -1` of {which}?"]
 
 
 def starts_anew(angle: Series) -> float:
@@ -434,11 +443,18 @@ def _find_turned_current(angle: Series, current: Series) -> list[str]:
     return []
 
 
-def _find_turned_force(angle: Series, force: Series) -> list[str]:
+def _may_clamp(angle: Series, force: Series) -> bool:
+    """Whether a force is another at one end of the travel than at the other, and next to nothing at one of them, as a clamp's
+    is whichever way it is counted."""
     low, high = _by_travel(angle, force)
     largest = float(np.quantile(np.abs(force.values), 0.99))
-    if abs(high - low) < _FOLLOWS * largest:
+    return abs(high - low) >= _FOLLOWS * largest and min(abs(low), abs(high)) <= _OPEN * largest
+
+
+def _find_turned_force(angle: Series, force: Series) -> list[str]:
+    if not _may_clamp(angle, force):
         return []
+    low, high = _by_travel(angle, force)
     if (reached := np.max(np.abs(force.values))) < _LEAST_CLAMP_N:
         return [f"ClampForceRef reaches {reached:.3g} N, which clamps nothing; is its unit right?"]
     if high < low:

@@ -32,6 +32,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
 #: A line's end before a separator.
 _LEFT_IN_CELLS = re.compile(rb"\r(?=[,;|\t])")
+#: How a trace of a PLC begins, and a time in it.
+_TRACE, _TIME = re.compile(rb"\s*\[key\]\s*;\s*\[value\]", re.IGNORECASE), re.compile(rb"-?\d+(?:[.,]\d+)?")
 #: A semicolon at the end of a line.
 _ENDED = re.compile(rb"(?m);[ \t]*(?=\r?$)")
 #: A name in quotes of a few lines, which begins and ends a cell.
@@ -68,7 +70,7 @@ def read_text(path: Path, content: bytes, names: list[str]) -> Any:
         content = content.replace(b"\r", b"\n")
     # Where Windows' files of one column each were put side by side, a line's end is left in every cell.
     content = _LEFT_IN_CELLS.sub(b"", content)
-    content = _in_one_line(_unlabelled(_unterminated(content)))
+    content = _in_one_line(_unlabelled(_unterminated(_traced(content))))
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", PREAMBLE + _UNITS)[: PREAMBLE + _UNITS]
     ]
@@ -223,6 +225,28 @@ def _as_utf8(content: bytes, names: list[str]) -> bytes:
                     return content.decode(letters).encode()
         return content.decode("latin-1").encode()
     return content.removeprefix(b"\xef\xbb\xbf")
+
+
+def _traced(content: bytes) -> bytes:
+    """A trace of a PLC (CODESYS, ctrlX), which has keys and then each variable's times and values, one variable below the
+    other, as a table of the variables by ``Time``; any other text as it is."""
+    if _TRACE.match(content) is None:
+        return content
+    names: dict[bytes, bytes] = {}
+    rows: dict[bytes, dict[bytes, bytes]] = {}
+    number = b""
+    for line in content.split(b"\n"):
+        key, *cells = (cell.strip() for cell in line.split(b";"))
+        if key.endswith(b".Variable"):
+            names[key.removesuffix(b".Variable")] = cells[0] if cells else b""
+        elif key.endswith(b".Data"):
+            number = key.removesuffix(b".Data")
+        elif not key and len(cells) == 2 and number in names and _TIME.fullmatch(cells[0]):
+            rows.setdefault(cells[0], {})[number] = cells[1]
+    # Variables of several tasks come at times of their own.
+    times = sorted(rows, key=lambda time: float(time.replace(b",", b".")))
+    table = [[b"Time", *names.values()], *([time, *(rows[time].get(n, b"") for n in names)] for time in times)]
+    return b"\n".join(map(b";".join, table))
 
 
 def _unlabelled(content: bytes) -> bytes:

@@ -45,6 +45,8 @@ _WORTH_SEEN = 1.25
 #: Least amplitude of an effect, in its standard deviations.
 _CLEAR = 3.0
 _DELAY_TITLE = "reference later than resolver (not in the calibration)"
+#: Factor by which a plain fit must leave less on left-out logs to be said: what noise alone makes.
+_PLAINLY = 1.05
 #: Style of many measured points behind a line.
 _CLOUD = Style("#aab4c0", mode="markers", size=3.0)
 
@@ -80,6 +82,8 @@ class StiffnessStep(Step):
         chosen: one of them.
         separate: fits of each pair of pads alone, where it has random logs.
         reached_N: largest force of the logs.
+        plain_N: RMS error on each slow log of a cubic of the angle for each way that is fitted to the others of its pads; None
+            where nothing was left out so.
     """
 
     pads: list[Pads]
@@ -88,6 +92,19 @@ class StiffnessStep(Step):
     chosen: Candidate
     separate: list[DynamicsFit]
     reached_N: float
+    plain_N: float | None = None
+
+    @property
+    def plainly_better(self) -> str:
+        """A line if that cubic predicts a left-out log clearly better than these models do; empty if not."""
+        ours_N = self.chosen.held_out_rmse
+        if self.plain_N is None or ours_N <= _PLAINLY * self.plain_N:
+            return ""
+        return (
+            f"a cubic of the angle for each way, fitted to the other slow logs, leaves {self.plain_N:.3g} N of the one left "
+            f"out, and a clamp's curve {ours_N:.3g} N: the force is no clamp's, or the logs begin at different places; sigma "
+            "holds what is left"
+        )
 
 
 def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
@@ -126,7 +143,30 @@ def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
         chosen=chosen,
         separate=separate,
         reached_N=reached,
+        plain_N=_plain(pads) if left_out and not any(own.random for own in pads) else None,
     )
+
+
+def _plain(groups: list[Pads]) -> float:
+    """`StiffnessStep.plain_N`."""
+    errors = []
+    for pads in groups:
+        x = np.concatenate([log.samples["angle"] for log in pads.logs])
+        middle, half = 0.5 * (np.min(x) + np.max(x)), max(0.5 * np.ptp(x), 1e-9)
+        tables = [_cubic_of_each_way((log.samples["angle"] - middle) / half) for log in pads.logs]
+        known = [np.isfinite(log.force_N) for log in pads.logs]
+        parts = [(table[told], log.force_N[told]) for table, told, log in zip(tables, known, pads.logs, strict=True)]
+        for number, (table, force) in enumerate(parts):
+            others = [part for other, part in enumerate(parts) if other != number]
+            fitted = np.linalg.lstsq(np.concatenate([t for t, _ in others]), np.concatenate([f for _, f in others]))[0]
+            errors.append(force - table @ fitted)
+    return rmse(np.concatenate(errors))
+
+
+def _cubic_of_each_way(x: np.ndarray) -> np.ndarray:
+    """Regressors, shape (n, 8)."""
+    cubic = np.vander(x, 4)
+    return np.column_stack([cubic, np.sign(np.gradient(x))[:, None] * cubic])
 
 
 def _candidate(groups: list[Pads], nominal: Calibration, effects: tuple[Effect, ...]) -> Candidate:
