@@ -320,10 +320,11 @@ def test_each_whole_period_that_a_tick_is_late_is_a_missed_one(setup: Setup, lat
     assert (daemon.ticks, daemon.missed) == (1, missed)
 
 
-@pytest.mark.parametrize(("pid", "timeout"), [(None, 3.0), (os.getpid(), 3.0), (1, None)])
-def test_a_watchdog_is_ours_unless_it_is_another_process_s(pid, timeout):
-    environment = {"WATCHDOG_USEC": "3000000"} | ({} if pid is None else {"WATCHDOG_PID": str(pid)})
-    assert ServiceManager(environment).watchdog_s == timeout and ServiceManager({}).watchdog_s is None
+def test_a_watchdog_is_ours_unless_it_is_another_process_s():
+    for pid, timeout in ((None, 3.0), (os.getpid(), 3.0), (1, None)):
+        environment = {"WATCHDOG_USEC": "3000000"} | ({} if pid is None else {"WATCHDOG_PID": str(pid)})
+        assert ServiceManager(environment).watchdog_s == timeout
+    assert ServiceManager({}).watchdog_s is None
 
 
 def test_a_scan_tells_who_was_estimated_when_from_what_and_whose_state_is_no_number():
