@@ -20,9 +20,9 @@ STIFFNESS_RELATIVE_SIGMA = "noise.stiffness_relative"
 
 #: Share by which the presliding angle may grow more than friction, whose angle it is over the stiffness of gear and bearings.
 #: In slow strokes a current that comes a cycle late looks like friction that turns over within twice the angle, an angle that
-#: comes late like a quarter of it. Of 77 trainings of brakes with other friction (`silent grid --faults nominal,gear_wear,
-#: cold_grease,friction_scale,tolerance,stribeck,friction_asymmetry,torque_constant --count 6 --seed 61`) all were between 0.53
-#: and 1.42 of it. And angle (rad), three counts of a resolver of 12 bit, that nobody sees.
+#: comes late like a quarter of it. Of 77 trainings of brakes with other friction (`silent grid --count 6 --seed 61`, families
+#: of gear, friction and motor) all were between 0.53 and 1.42 of it. And angle (rad), three counts of a resolver of 12 bit,
+#: that nobody sees.
 _SOFTER_GEAR, _SEEN_RAD = 0.25, 0.005
 #: Number of points of the travel at which a curve is checked.
 TRAVELS = 40

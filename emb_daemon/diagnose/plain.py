@@ -20,7 +20,7 @@ def plain_left(fitted: Bench, kept: np.ndarray, judged: Bench, asked: np.ndarray
         asked: which of their samples are, shape (m,).
     """
     columns, wanted = _table(fitted)
-    scale = np.sqrt(np.mean(columns[kept] ** 2, axis=0)) if kept.any() else np.ones(columns.shape[1])
+    scale = np.linalg.norm(columns[kept], axis=0)
     scale[scale == 0.0] = 1.0
     found = np.linalg.lstsq(columns[kept] / scale, wanted[kept])[0] / scale
     there, measured = _table(judged)

@@ -12,7 +12,7 @@ import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle
 from emb_daemon.diagnose.evidence import Evidence
-from emb_daemon.diagnose.model import LASTING, Model, is_shape
+from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, SHADOW, SLIDING, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence
@@ -339,8 +339,10 @@ def weigh_confounded(selection: Selection) -> Selection:
         samples = SLIDING if models[0].bench.shows_turning(channel) else 1
         scale = min(model.inflation(channel) * model.noise(channel) for model in models)
         own, others = (model.log_posterior(channel, samples, scale) for model in models)
-        winner, loser = (candidate, other) if own >= others else (other, candidate)
-        if own < others:
+        # Fits that end within their tolerance are as good, as of two that are the same torque in a machine without load.
+        better = others - own > TOLERANCE * abs(own)
+        winner, loser = (other, candidate) if better else (candidate, other)
+        if better:
             selection = instead
         selection = selection.noted(_weighed(selection.candidates[winner.effect.name], loser, abs(own - others) > _SURE))
     return selection

@@ -246,12 +246,12 @@ def _unseen(s, p, m):
 
 @njit
 def _swings(s, p, slid):
-    """Whether the gear, which has ``slid`` on by so many rad, goes to and fro by less than turns friction over."""
-    short = _SHORT * p.presliding_angle
+    """Whether the gear, which has ``slid`` on by so many rad, goes back where it came from, and by less than turns friction
+    over."""
     if slid * s.swing < 0.0:
         s.swing_before, s.swing = abs(s.swing), 0.0
     s.swing += slid
-    return slid != 0.0 and max(s.swing_before, abs(s.swing)) < short
+    return slid != 0.0 and abs(s.swing) <= s.swing_before < _SHORT * p.presliding_angle
 
 
 @njit

@@ -121,7 +121,7 @@ def why_implausible(snapshot: Record, p: Record) -> str:
         "scale": LEAST_SCALE <= snapshot["scale"] <= MOST_SCALE,
         "creep": np.all(np.abs(snapshot["creep"]) <= MOST_CREEP),
         "growth": abs(snapshot["growth"]) * p["gear_gain"] <= _GROWTH_M_PER_K,
-        "covariance": np.all(np.isfinite(correlation)) and np.linalg.eigvalsh(correlation)[0] > -1e-3,
+        "covariance": np.all(np.abs(correlation) <= 1.0 + 1e-6) and np.linalg.eigvalsh(correlation)[0] > -1e-3,
         "error": np.all(snapshot["error"] ** 2 <= _SIGMAS**2 * (np.diag(prior) + np.diag(covariance))),
         "winding": 0.0 <= snapshot["winding"] <= _HEAT,
         "housing": 0.0 <= snapshot["housing"] <= _HEAT,
