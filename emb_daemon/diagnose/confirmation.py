@@ -39,6 +39,8 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
 
     Returns it with the errors on left-out episodes. ``judges``: the validation logs."""
     confirmed = _confirmed(selection, judges)
+    if selection.longer is not None and {*confirmed[0].accepted} <= {*selection.longer.accepted}:
+        confirmed = _with_longer(confirmed, selection.longer, judges)
     if selection.instead is None:
         return confirmed
     alone = _confirmed(selection.instead, judges)
@@ -50,6 +52,22 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
         return confirmed
     worse = "effects of the catalogue alone leave less of left-out episodes and validation logs"
     return alone[0].noted(replace(c, accepted=False, reason=worse if c.accepted else c.reason) for c in terms), alone[1]
+
+
+def _with_longer(
+    confirmed: tuple[Selection, EpisodeErrors], longer: Selection, judges: Bench | None
+) -> tuple[Selection, EpisodeErrors]:
+    """The same, or with the terms that went because their path is described more shortly without them. It is not if the refit
+    that describes it so was taken out again: then they stay, if they are confirmed and leave less of the path."""
+    terms = [name for name in longer.accepted if name not in confirmed[0].accepted]
+    paths = {longer.candidates[name].channel for name in terms}
+    if not terms or not paths <= confirmed[0].refused.keys() - confirmed[0].touched:
+        return confirmed
+    found = _confirmed(longer, judges)
+    if not {*terms} <= {*found[0].accepted}:
+        return confirmed
+    left, without = _left(found[0], judges), _left(confirmed[0], judges)
+    return found if all(left[path] < without[path] for path in paths & left.keys()) else confirmed
 
 
 def _left(selection: Selection, judges: Bench | None) -> dict[str, float]:

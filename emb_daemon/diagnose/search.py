@@ -59,6 +59,8 @@ def select(bench: Bench, progress: Progress) -> Selection:
     found = make_terms(selection, lambda text: progress(text, 0.72))
     progress("refitting what is applied", 0.75)
     final = _finished(found)
+    if found.longer is not None:
+        final = replace(final, longer=_finished(found.longer))
     if found.accepted == selection.accepted or {*selection.accepted} <= {*final.accepted}:
         return final
     return replace(final, instead=_finished(selection))

@@ -54,6 +54,7 @@ class Selection:
         dropped: effects that were accepted and are not to be tried again.
         at_first: what the residual depended on before any effect was accepted, by channel.
         instead: what was chosen out of the catalogue alone, where some of it gave way to terms.
+        longer: what was chosen with a term that went because its path, refitted, is described more shortly without it.
     """
 
     model: Model
@@ -64,6 +65,7 @@ class Selection:
     dropped: frozenset[str] = frozenset()
     at_first: Mapping[str, list[Dependence]] = field(default_factory=dict)
     instead: "Selection | None" = None
+    longer: "Selection | None" = None
 
     @property
     def accepted(self) -> list[str]:
