@@ -373,7 +373,7 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
         reasons: dict[str, str]
         model = SimpleNamespace(bench=bench)
         recalibrated = ()
-        instead = None
+        instead = longer = None
 
         def without(self, suspect, reason):
             return Chosen([name for name in self.suspects if name != suspect], self.reasons | {suspect: reason})
@@ -416,7 +416,7 @@ def test_a_recalibration_that_went_for_what_an_effect_did_comes_back(monkeypatch
             bench=SimpleNamespace(calibration=None, residuals=lambda _: {}), refined=lambda _: Chosen.model
         )
         touched = property(lambda self: {*self.recalibrated})
-        instead = None
+        instead = longer = None
 
         def without(self, suspect, _):
             left = {c: gain for c, gain in self.recalibrated.items() if c != suspect}
@@ -453,6 +453,23 @@ def test_an_effect_that_gave_way_to_a_term_is_asked_again_where_nothing_was_fitt
     found, of = confirmation.confirm(dataclasses.replace(made, instead=named), None)
     assert found.accepted == of.accepted == [name]
     assert name == term.name or "leave less" in found.candidates[term.name].reason
+
+
+@pytest.mark.parametrize(
+    ("refused", "left_N2", "confirmed", "stays"),
+    [(True, 90.0, True, True), (False, 90.0, True, False), (True, 110.0, True, False), (True, 90.0, False, False)],
+    ids=["refit not applied", "refit applied", "leaves more", "not confirmed"],
+)
+def test_a_description_is_shorter_only_if_its_refit_is_applied(monkeypatch, viscous, refused, left_N2, confirmed, stays):
+    """A torque constant over current of 150 N was described more shortly by a torque path that was not applied then."""
+    base = dataclasses.replace(viscous[0], candidates={}, recalibrated={} if refused else {"torque": 30.0})
+    base = dataclasses.replace(base, refused={"torque": (30.0, "worse")} if refused else {})
+    term = dataclasses.replace(REGISTRY[0], name="term:torque_constant:current")
+    longer = base.noted([Candidate(term, "torque", accepted=True)])
+    monkeypatch.setattr(confirmation, "_confirmed", lambda s, _: (s if s is not longer or confirmed else base, s))
+    monkeypatch.setattr(confirmation, "_left", lambda s, _: {"torque": left_N2 if s is longer else 100.0})
+    found, of = confirmation.confirm(dataclasses.replace(base, longer=longer), None)
+    assert (found is longer) == (of is longer) == stays
 
 
 @pytest.mark.parametrize("gave_way", [True, False])
