@@ -12,7 +12,7 @@ import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle
 from emb_daemon.diagnose.evidence import Evidence
-from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, is_shape
+from emb_daemon.diagnose.model import LASTING, Model, is_shape
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS
 from emb_daemon.diagnose.screening import Q_VALUE, SHADOW, SLIDING, Candidate, Screening, groups
 from emb_daemon.diagnose.unexplained import Dependence
@@ -26,6 +26,9 @@ _EQUAL = 0.97
 #: Log-odds, 99 to 1, from which one of two explains what the other does not: the priors have a share in such a difference,
 #: which the jackknife over episodes does not know.
 _SURE = float(np.log(1.0 / Q_VALUE))
+#: Odds up to which neither of two is more probable, nats: 11 to 10. In a machine without load an offset of the current and an
+#: asymmetry of its friction are the same torque.
+_EVEN = 0.1
 #: A candidate whose chance is below this but not sure, and that explains this share of the mean square of what lasts of the
 #: residual, is fitted before it is judged. Not of all of it: what differs from sample to sample no effect explains, and in the
 #: current that is most.
@@ -341,8 +344,7 @@ def weigh_confounded(selection: Selection) -> Selection:
         samples = SLIDING if models[0].bench.shows_turning(channel) else 1
         scale = min(model.inflation(channel) * model.noise(channel) for model in models)
         own, others = (model.log_posterior(channel, samples, scale) for model in models)
-        # Fits that end within their tolerance are as good, as of two that are the same torque in a machine without load.
-        better = others - own > TOLERANCE * abs(own)
+        better = others - own > _EVEN
         winner, loser = (other, candidate) if better else (candidate, other)
         if better:
             selection = instead
