@@ -303,11 +303,11 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     at_port = sum(share for (port, _), share in shares.items() if port == prospect.form.port)
     sure = f"same port in {100 * at_port:.0f} % of bootstraps, and signal in {100 * shares[prospect.means]:.0f} %"
     candidate = found.candidates[_name(prospect.form, selection)]
-    if at_port < _SAME_PORT:
-        return selection.noted([replace(candidate, accepted=False, reason=sure)])
+    longer, unsure = straight and _is_longer(found, selection, channel), at_port < _SAME_PORT
     found = found.noted([replace(candidate, reason=f"{candidate.reason}; {sure}")])
-    if straight and _is_longer(found, selection, channel):
-        return replace(selection.noted([replace(candidate, accepted=False, reason=_NOT_SHORTER)]), longer=found)
+    if longer or unsure:
+        refused = selection.noted([replace(candidate, accepted=False, reason=_NOT_SHORTER if longer else sure)])
+        return refused if unsure else replace(refused, longer=found)
     return found
 
 
