@@ -210,3 +210,21 @@ def test_the_demo_is_the_monitor_with_the_truth_beside_it(width, height):
         assert "23.45 kN ± 0.12" in lines[first] and "degraded" in lines[first] and "512/345 °C" in lines[first + 1]
         assert "reference 23.46 kN" in lines[first + 2] and "signal stuck" in lines[first + 3]
     assert any("simulated truth" in line for line in lines) and ("info: ready" in lines) == (height > 24)
+
+
+def test_the_truth_beside_an_estimate_is_of_its_moment(monkeypatch):
+    """While frames are read the car drives on; 60 ms of a stroke would look like an error of 3 kN."""
+    recorder, truth = Recorder(("FL",), 1.0), np.zeros(1, TRUTH)
+    truth["force"] = 10_000.0
+    recorder.note_sent(100 * S, truth)
+    recorder.note_heard(_force(0, 10.0))
+    hear = recorder._listener.hear
+
+    def drive_on(frames):
+        hear(frames)
+        truth["force"] = 13_310.0
+        recorder.note_sent(100 * S + 60_000_000, truth)
+
+    monkeypatch.setattr(recorder._listener, "hear", drive_on)
+    [corner] = recorder.present(100 * S)
+    assert corner.state(100 * S)["clamp_force_ref_kN"] == 10.0

@@ -78,12 +78,13 @@ class Recorder:
 
     def present(self, now_ns: int) -> list[Corner]:
         """The corners as the monitor knows them from their broadcasts so far, with the true force as reference."""
-        count = self.count
+        # The car drives on while the frames are read: the reference is that of the last of them.
+        count, forces = self.count, self.truth["force"][self.cycles - 1]
         self._listener.hear(self.frames[self._listened : count])
         self._listened = count
         corners = [self._listener.corners[CORNERS.index(name)] for name in self.corners]
-        for corner, truth in zip(corners, self.truth[self.cycles - 1], strict=True):
-            corner.refer(truth["force"], now_ns)
+        for corner, force_N in zip(corners, forces, strict=True):
+            corner.refer(force_N, now_ns)
         return corners
 
     def recent_responses(self) -> np.ndarray:
