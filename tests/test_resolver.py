@@ -9,7 +9,8 @@ from diagnosekit import drives
 
 from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
-from emb_daemon.offline import estimate, log_of
+from emb_daemon.estimator import resolver
+from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.wire import contract as r
 
 
@@ -73,6 +74,16 @@ def test_what_a_resolver_errs_by_while_it_turns_hides_no_jump_at_rest(shown, beg
 
     estimates, _ = city.changed(change, 0, 60.0)
     assert estimates["reasons"][begin] & r.OUT_OF_RANGE and not estimates["reasons"][begin - 1] & r.OUT_OF_RANGE
+
+
+@pytest.mark.parametrize("log", ["rig/integrated/val", "rig_h/integrated/val", "rig/service/nominal"])
+def test_resolvers_that_are_well_differ_from_their_speed_by_counts(shared, log):
+    """Of rigs that are simulated by others: by less than what is a jump over five, of either kind, turning or not."""
+    samples = load_log(shared / f"{log}.log.gz").samples
+    speed = samples["speed"]
+    slip = np.diff(samples["angle"]) - 0.5 * (speed[1:] + speed[:-1]) * samples["dt"][1:]
+    beyond = abs(slip) - resolver._SLIP_DELAY_S * abs(np.diff(speed))
+    assert beyond[samples["dt"][1:] < 0.006].max() < 0.5 * resolver._LEAST_SLIP_RAD
 
 
 @pytest.mark.parametrize("begin", [6000, 11000])

@@ -18,11 +18,10 @@ from emb_daemon.models.stiffness import characteristic_curve, travel_at
 STIFFNESS_SIGMA = "noise.stiffness_N"
 STIFFNESS_RELATIVE_SIGMA = "noise.stiffness_relative"
 
-#: Share by which the presliding angle may grow more than friction, whose angle it is over the stiffness of gear and bearings.
-#: In slow strokes a current that comes a cycle late looks like friction that turns over within twice the angle, an angle that
-#: comes late like a quarter of it. Of 77 trainings of brakes with other friction (`silent grid --count 6 --seed 61`, families
-#: of gear, friction and motor) all were between 0.53 and 1.42 of it. And angle (rad), three counts of a resolver of 12 bit,
-#: that nobody sees.
+#: Share by which the presliding angle may grow more than friction, whose angle it is over the stiffness of gear and bearings:
+#: a choice. In slow strokes a current that comes a cycle late looks like friction that turns over within twice the angle, an
+#: angle that comes late like a quarter of it (`test_adapt.py::test_a_current_of_another_cycle_is_no_other_friction`). And
+#: angle (rad), three counts of a resolver of 12 bit, that nobody sees.
 _SOFTER_GEAR, _SEEN_RAD = 0.25, 0.005
 #: Number of points of the travel at which a curve is checked.
 TRAVELS = 40

@@ -21,9 +21,9 @@ _ANGLE_MARGIN = 0.5
 _GAINED, _AS_BEFORE, _NO_SPEED = 0.5, 0.2, 2.0
 #: Ways in a sample, rad, by which angle and speed differ, beyond a delay of this many seconds between both. The zero has
 #: jumped where they differ by so many times what they have differed by of late while the motor turned, or stood: at most by
-#: the last, which holds before anything is known, and at least by the other. In most of 80 logs of simulated rigs and
-#: strangers nothing differs by more than 0.005 rad, and in none by more than 0.01. What was seen counts less as the motor
-#: gains and loses speed, which shows a delay, rad/s: over some strokes.
+#: the last, which holds before anything is known, and at least by the other, which is what seven counts of a resolver of 12
+#: bit are (`test_resolver.py::test_resolvers_that_are_well_differ_from_their_speed_by_counts`). What was seen counts less as
+#: the motor gains and loses speed, which shows a delay, rad/s: over some strokes.
 _SLIP_DELAY_S, _BEYOND_SLIPS, _LEAST_SLIP_RAD, MOST_SLIP_RAD, _SLIPS_KEPT_RAD_PER_S = 0.01, 5.0, 0.01, 0.06, 1000.0
 #: Standard deviation of a way of which the noise is not known, rad.
 _ZERO_RAD = 0.1
@@ -104,10 +104,7 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
         # What has just moved it by little more than counts comes back by little less.
         moved, sigma = slip, limit / _SURELY
     elif seen:
-        kept = exp(-max(abs(m.speed - s.speed) - STANDING_RAD_PER_S, 0.0) / _SLIPS_KEPT_RAD_PER_S)
-        for i in range(len(s.largest_slip)):
-            s.largest_slip[i] *= kept
-        s.largest_slip[stands] = max(s.largest_slip[stands], abs(slip) - by_delay)
+        _know_slips(s, m, stands, abs(slip) - by_delay)
         moved = _drift(s, m, slip, turned)
         if moved != 0.0:
             sigma = abs(moved)
@@ -120,6 +117,16 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     if moved != 0.0:
         _move_zero(s, p, moved, sigma)
     return moved != 0.0
+
+
+@njit
+def _know_slips(s, m, stands, slip):
+    """Take a ``slip`` (rad) by which angle and speed differ in a sample although the zero has not moved; ``stands``: 1 of a
+    motor that stands, else 0."""
+    kept = exp(-max(abs(m.speed - s.speed) - STANDING_RAD_PER_S, 0.0) / _SLIPS_KEPT_RAD_PER_S)
+    for i in range(len(s.largest_slip)):
+        s.largest_slip[i] *= kept
+    s.largest_slip[stands] = max(s.largest_slip[stands], slip)
 
 
 @njit
