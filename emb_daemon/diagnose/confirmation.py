@@ -58,14 +58,12 @@ def _with_longer(
     confirmed: tuple[Selection, EpisodeErrors], longer: Selection, judges: Bench | None
 ) -> tuple[Selection, EpisodeErrors]:
     """The same, or with the terms that went because their path is described more shortly without them. It is not if the refit
-    that describes it so was taken out again: then they stay, if they are confirmed and leave less of the path."""
+    that describes it so was taken out again: then they stay, if what is confirmed with them leaves less of the path."""
     terms = [name for name in longer.accepted if name not in confirmed[0].accepted]
     paths = {longer.candidates[name].channel for name in terms}
     if not terms or not paths <= confirmed[0].refused.keys() - confirmed[0].touched:
         return confirmed
     found = _confirmed(longer, judges)
-    if not {*terms} <= {*found[0].accepted}:
-        return confirmed
     left, without = _left(found[0], judges), _left(confirmed[0], judges)
     return found if all(left[path] < without[path] for path in paths & left.keys()) else confirmed
 
