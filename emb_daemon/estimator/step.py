@@ -251,12 +251,14 @@ def _follow_noise(s, p, m):
             and stand(s.lateness, then if age > 0.0 else m.speed, s.speed_sigma)
         ):
             s.strayed = np.nan
-            forget_wander(s.wander)
-            if s.drifting_s > 0.0:
-                # The zero has not drifted: the contact counts anew from the released position, in which the motor stands.
+            if s.drifting_s > 0.0 or s.wander.found:
+                # The zero has not drifted. What stops have taught beside a contact that moved with it is forgotten, and the
+                # contact counts anew from the released position, in which the motor stands.
                 s.drifting_s = 0.0
                 believe_resolver(s.plausibility)
+                go_back(s, p)
                 place_contact(s, p, m.angle)
+            forget_wander(s.wander)
     s.speed_sigma = max(sqrt(s.speed_square), p.speed_sigma)
 
 
