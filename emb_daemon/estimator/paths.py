@@ -165,11 +165,18 @@ def rest(s: Record, p: Record, x: float, factor: float) -> None:
 
 
 @njit
-def _stand(s, m):
-    """The motor stands at a first sample, and friction is unknown."""
-    s.started = True
-    s.angle, s.slid_angle, s.speed = m.angle, m.angle, m.speed
+def doubt_friction(s: Record, angle: float) -> None:
+    """The motor stands at ``angle`` rad, and which way friction holds it is unknown."""
+    s.slid_angle = angle
     s.friction_state, s.friction_variance = 0.0, 1.0
+
+
+@njit
+def _stand(s, m):
+    """The motor stands at a first sample."""
+    s.started = True
+    s.angle, s.speed = m.angle, m.speed
+    doubt_friction(s, m.angle)
 
 
 @njit

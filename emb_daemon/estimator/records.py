@@ -100,8 +100,9 @@ STATE = np.dtype(
         # Angle (rad) gone without speed since the motor stands, and for how long; time for which that still counts.
         *fields("f8", "drifted stood_s drifting_s"),
         # Angle (rad) gone beyond the integrated speed since the motor last stood, that integral, and the time for which it
-        # turned, s; the first is no number where part of the way was not seen. Way by which an angle that repeats is behind.
-        *fields("f8", "strayed turned turned_s behind"),
+        # turned, s; the first is no number where part of the way was not seen. Way by which an angle that repeats is behind,
+        # and for how long, s.
+        *fields("f8", "strayed turned turned_s behind behind_s"),
         # Way (rad) by which the zero has moved since ``away_s`` s, its variance (rad2), and that of the contact angle before.
         *fields("f8", "away away_variance away_s known_before"),
         # Largest way (rad) in a sample by which angle and speed of late differed although the zero had not moved: while the

@@ -9,6 +9,7 @@ from emb_daemon.estimator.hypotheses import open_again
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, shift_zero
 from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.fusion import CONTACT, STATES
+from emb_daemon.models.lateness import LARGEST_OFFSET
 from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
 
 #: A speed beyond the motor's maximum by this factor (overspeed of IEC 60034-1), and an angle by this many rad more (half of
@@ -46,6 +47,8 @@ _SPEED_GAIN = 0.02
 #: Samples in a row in which angle and speed repeat to the bit, from which both are stale: by chance, at one repetition in five
 #: of a motor that stands, one in a hundred.
 _REPEATED = 3
+#: Time for which a loose contact repeats an angle, s.
+_BEHIND_S = 0.1
 
 
 @njit
@@ -88,7 +91,8 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     # Before it has stood for so long, an angle that is late may still be turning.
     stands = int(s.stood_s > _AT_REST_S and abs(m.speed) < STANDING_RAD_PER_S)
     limit = _BEYOND_SLIPS * min(max(s.largest_slip[stands], _LEAST_SLIP_RAD), MOST_SLIP_RAD)
-    behind = s.behind
+    # What repeats for longer than a loose contact does, beside a low speed, stands, and the speed has an offset.
+    behind = s.behind if s.behind_s < _BEHIND_S or abs(s.behind) > LARGEST_OFFSET * s.behind_s else 0.0
     _stay_behind(s, m, jump, turned)
     # A loose contact repeats an angle, which is right again when it has made up for the way; one that is late by a cycle
     # repeats whenever a motion begins. What it lacks then counts as what it makes up for: it has strayed by neither.
@@ -147,9 +151,10 @@ def _stay_behind(s, m, jump, turned):
     """Keep the way (rad) by which an angle that repeats is behind; ``jump`` and ``turned`` rad are what this sample adds to
     the angle and by the speed."""
     if jump != 0.0 or s.plausibility.still >= _REPEATED or m.dt > ONE_CYCLE_S:
-        s.behind = 0.0
+        s.behind = s.behind_s = 0.0
     elif abs(turned) > STANDING_RAD_PER_S * m.dt:
         s.behind += turned
+        s.behind_s += m.dt
 
 
 @njit

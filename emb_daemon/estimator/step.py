@@ -16,7 +16,7 @@ from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
-from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_memory, stiffness_path, torque_path
+from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_friction, doubt_memory, stiffness_path, torque_path
 from emb_daemon.estimator.resolver import MOST_SLIP_RAD, SPEED_MARGIN, at_rest, believe_speed, follow_zero
 from emb_daemon.estimator.rewind import forget_stroke, go_back, keep_all
 from emb_daemon.estimator.status import (
@@ -51,6 +51,7 @@ from emb_daemon.estimator.unknown import (
 )
 from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models.alignment import align, aligned
+from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
 from emb_daemon.models.gear import back_through_gear, steepest, through_gear
 from emb_daemon.models.lateness import find_filter, follow, interrupt, speed_then, stand, unfilter, way_beside
@@ -259,6 +260,9 @@ def _follow_noise(s, p, m):
                 go_back(s, p)
                 place_contact(s, p, m.angle)
             forget_wander(s.wander)
+            # Friction had seemed to turn over in a motor that stands.
+            doubt_friction(s, m.angle)
+            forget_level(s.contact)
     s.speed_sigma = max(sqrt(s.speed_square), p.speed_sigma)
 
 

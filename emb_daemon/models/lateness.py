@@ -45,7 +45,7 @@ _CLEAR_S, _CLEAR = 2.5e-4, 0.04
 #: Samples of a motor that stands over which its speed is averaged, standard deviations of that mean from which it is an
 #: offset, and largest offset, rad/s: a motor that went faster for as long would have gone a turn. Samples over which an offset
 #: is refined, to a hundredth of the noise.
-_FEWEST, _MOST, _CERTAIN, _LARGEST, _REMEMBERED = 50.0, 250.0, 5.0, 6.0, 10_000.0
+_FEWEST, _MOST, _CERTAIN, LARGEST_OFFSET, _REMEMBERED = 50.0, 250.0, 5.0, 6.0, 10_000.0
 
 #: Speeds that are kept: at 250 Hz as old as the oldest angle that a calibration may state, 50 ms.
 _KEPT = 14
@@ -174,7 +174,7 @@ def stand(a: Record, speed: float, noise: float) -> bool:
     a.standing += speed
     a.stood += 1.0
     mean = a.standing / a.stood
-    found = a.stood >= _FEWEST and abs(mean) > _CERTAIN * noise / sqrt(a.stood) and abs(a.offset + mean) < _LARGEST
+    found = a.stood >= _FEWEST and abs(mean) > _CERTAIN * noise / sqrt(a.stood) and abs(a.offset + mean) < LARGEST_OFFSET
     if found:
         a.offset += mean
         a.known = a.stood
