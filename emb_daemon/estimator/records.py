@@ -103,8 +103,11 @@ STATE = np.dtype(
         # turned, s; the first is no number where part of the way was not seen. Way by which an angle that repeats is behind,
         # and for how long, s.
         *fields("f8", "strayed turned turned_s behind behind_s"),
-        # Way (rad) by which the zero has moved since ``away_s`` s, its variance (rad2), and that of the contact angle before.
+        # Way (rad) by which the zero has moved since ``away_s`` s, its variance (rad2), and that of the contact angle before;
+        # where motor and friction were before that, and whether the contact was confirmed.
         *fields("f8", "away away_variance away_s known_before"),
+        *fields("f8", "angle_then slid_then friction_then friction_variance_then"),
+        ("confirmed_then", "?"),
         # Largest way (rad) in a sample by which angle and speed of late differed although the zero had not moved: while the
         # motor turned, and while it stood.
         ("largest_slip", "f8", (2,)),

@@ -195,6 +195,8 @@ def _move_zero(s, p, moved, sigma):
     if s.away_s > _AWAY_S:
         s.away = s.away_variance = s.away_s = 0.0
         s.known_before = before
+        s.angle_then, s.slid_then, s.confirmed_then = s.angle, s.slid_angle, s.contact.confirmed
+        s.friction_then, s.friction_variance_then = s.friction_state, s.friction_variance
     went = s.away
     s.away += moved
     s.away_variance += sq(sigma)
@@ -206,6 +208,10 @@ def _move_zero(s, p, moved, sigma):
         for i in range(STATES):
             s.covariance[CONTACT, i] *= known
             s.covariance[i, CONTACT] *= known
+        # What these messages said of the motion had turned friction over.
+        s.angle, s.slid_angle = s.angle_then, s.slid_then
+        s.friction_state, s.friction_variance = s.friction_then, s.friction_variance_then
+        s.contact.confirmed = s.confirmed_then
         return
     shift_zero(s, moved)
     s.covariance[CONTACT, CONTACT] += sq(s.gear_slope * sigma)
