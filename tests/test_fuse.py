@@ -167,12 +167,12 @@ def test_the_zero_follows_a_drift_that_is_certain_and_its_share_of_the_rest(p, s
 )
 def test_a_zero_that_comes_back_has_never_moved(p, s, moved, back, returns):
     """Within its standard deviations, three times; the contact is known as well as before then."""
-    s["away_s"], s["covariance"] = 1e9, 0.0
+    s["away"]["seconds"], s["covariance"] = 1e9, 0.0
     s["covariance"][fuse.CONTACT, fuse.CONTACT], s["gear_slope"] = 1e-4, 1.0
-    resolver._move_zero(s, p, moved, 0.05)
+    resolver._move_zero(s, p, moved, 0.05, False)
     assert s["contact_angle"] == moved and s["covariance"][fuse.CONTACT, fuse.CONTACT] == pytest.approx(1e-4 + 0.05**2)
-    s["away_s"] = CYCLE_S
-    resolver._move_zero(s, p, back, 0.05)
+    s["away"]["seconds"] = CYCLE_S
+    resolver._move_zero(s, p, back, 0.05, False)
     if returns:
         assert s["contact_angle"] == pytest.approx(0.0) and s["covariance"][fuse.CONTACT, fuse.CONTACT] == pytest.approx(1e-4)
     else:

@@ -7,6 +7,7 @@ from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.force_sensor import FORCE_SENSOR, FORCE_SENSOR_PARAMETERS
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
 from emb_daemon.estimator.monitor import MONITOR
+from emb_daemon.estimator.resolver import AWAY
 from emb_daemon.estimator.rewind import LEARNED, STOPS
 from emb_daemon.estimator.straying import STRAYING
 from emb_daemon.estimator.uneven import UNEVEN
@@ -103,11 +104,8 @@ STATE = np.dtype(
         # turned, s; the first is no number where part of the way was not seen. Way by which an angle that repeats is behind,
         # and for how long, s.
         *fields("f8", "strayed turned turned_s behind behind_s"),
-        # Way (rad) by which the zero has moved since ``away_s`` s, its variance (rad2), and that of the contact angle before;
-        # where motor and friction were before that, and whether the contact was confirmed.
-        *fields("f8", "away away_variance away_s known_before"),
-        *fields("f8", "angle_then slid_then friction_then friction_variance_then"),
-        ("confirmed_then", "?"),
+        # A zero that has moved, and what was believed before.
+        ("away", AWAY),
         # Largest way (rad) in a sample by which angle and speed of late differed although the zero had not moved: while the
         # motor turned, and while it stood.
         ("largest_slip", "f8", (2,)),

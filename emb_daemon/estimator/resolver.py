@@ -7,10 +7,23 @@ import numpy as np
 
 from emb_daemon.estimator.hypotheses import open_again
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, shift_zero
-from emb_daemon.jit import Record, hypot, njit, sq
+from emb_daemon.jit import Record, fields, hypot, njit, sq
 from emb_daemon.models.fusion import CONTACT, STATES
 from emb_daemon.models.lateness import LARGEST_OFFSET
+from emb_daemon.models.plausibility import AGREE, believe_resolver
 from emb_daemon.models.wander import OFFSET_RAD_PER_S, STANDING_RAD_PER_S
+
+#: ``way`` rad by which the zero has moved since ``seconds`` s, and its ``variance``, rad². What was believed before, and is so
+#: again if it comes back: ``known`` variance of the contact angle, rad²; ``angle``, and that to which the gear ``slid``, rad,
+#: and ``speed``, rad/s; ``friction`` state and its variance; ways ``strayed`` and ``turned``, rad; for how long the motor had
+#: ``stood``, s; whether the contact was ``confirmed``, and the resolver ``believed``.
+AWAY = np.dtype(
+    [
+        *fields("f8", "way variance seconds known angle speed slid friction friction_variance strayed turned stood"),
+        *fields("?", "confirmed believed"),
+    ],
+    align=True,
+)
 
 #: A speed beyond the motor's maximum by this factor (overspeed of IEC 60034-1), and an angle by this many rad more (half of
 #: what a contact angle jumps by at once), is no motion.
@@ -61,6 +74,9 @@ def believe_speed(s: Record, p: Record, m: Record) -> None:
         return
     by_angle = (m.angle - s.angle) / m.dt
     gained, apart = abs(m.speed - s.speed), abs(by_angle - s.speed)
+    if may_come_back(s):
+        # The last messages may have been wrong in both.
+        gained = min(gained, abs(m.speed - s.away.speed))
     if min(gained, abs(m.speed - by_angle)) <= _GAINED * p.maximum_speed:
         return
     if apart <= _AS_BEFORE * p.maximum_speed or max(abs(m.speed), abs(by_angle)) > _NO_SPEED * p.maximum_speed:
@@ -82,12 +98,15 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
     stuck = s.plausibility.still > 1 or frozen_s > 0.0
     reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
-    moved, sigma = 0.0, 0.0
+    moved, sigma, back = 0.0, 0.0, False
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
     slip = jump - turned
     # A speed that was late is as far off as one that went through the filter that is undone in its place.
     by_delay = (_SLIP_DELAY_S + s.lateness.filtered) * abs(m.speed - s.speed)
     unsure = by_delay + _BEYOND_SLIPS * MOST_SLIP_RAD
+    if s.stood_s > _AT_REST_S:
+        # A motor that starts gets no further within a cycle, and whatever is late came from rest as well.
+        by_delay = min(by_delay, 0.5 * _GAINED * p.maximum_speed * m.dt)
     # Before it has stood for so long, an angle that is late may still be turning.
     stands = int(s.stood_s > _AT_REST_S and abs(m.speed) < STANDING_RAD_PER_S)
     limit = _BEYOND_SLIPS * min(max(s.largest_slip[stands], _LEAST_SLIP_RAD), MOST_SLIP_RAD)
@@ -104,22 +123,25 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
         moved, sigma = (slip, hypot(_ZERO_RAD, 0.5 * m.dt * (m.speed - s.speed))) if seen else (jump, reach)
     elif seen and min(abs(slip), abs(s.plausibility.apart + slip)) > by_delay + limit and not repeats:
         moved, sigma = slip, limit / _SURELY
-    elif seen and s.away_s < _AWAY_S and abs(s.away + slip) < min(limit, 0.5 * abs(s.away)):
+    elif seen and may_come_back(s) and abs(s.away.way + slip) < min(limit, 0.5 * abs(s.away.way)):
         # What has just moved it by little more than counts comes back by little less.
-        moved, sigma = slip, limit / _SURELY
+        moved, sigma, back = slip, limit / _SURELY, True
     elif seen:
+        if stands and abs(slip) > _LEAST_SLIP_RAD:
+            # Nothing has turned that was at rest and does not show a speed: this slides no gear.
+            s.slid_angle += slip
         _know_slips(s, m, stands, abs(slip) - by_delay)
         moved = _drift(s, m, slip, turned)
         if moved != 0.0:
             sigma = abs(moved)
             s.drifting_s = _DRIFTING_S
     s.drifting_s = max(s.drifting_s - m.dt, 0.0)
-    if moved != 0.0 or not seen:
+    if not seen:
         # A motion that was not observed completely cannot be checked at its end.
         s.strayed = np.nan
-    s.away_s += m.dt
+    s.away.seconds += m.dt
     if moved != 0.0:
-        _move_zero(s, p, moved, sigma)
+        _move_zero(s, p, moved, sigma, back)
     return moved != 0.0
 
 
@@ -188,35 +210,62 @@ def _drift(s, m, slip, turned):
 
 
 @njit
-def _move_zero(s, p, moved, sigma):
-    """Refer all stored angles to a zero that has moved by ``moved`` rad, known with standard deviation ``sigma`` rad."""
-    s.drifted = s.stood_s = 0.0
-    before = s.covariance[CONTACT, CONTACT]
-    if s.away_s > _AWAY_S:
-        s.away = s.away_variance = s.away_s = 0.0
-        s.known_before = before
-        s.angle_then, s.slid_then, s.confirmed_then = s.angle, s.slid_angle, s.contact.confirmed
-        s.friction_then, s.friction_variance_then = s.friction_state, s.friction_variance
-    went = s.away
-    s.away += moved
-    s.away_variance += sq(sigma)
-    if abs(s.away) < _SURELY * sqrt(s.away_variance) < abs(went):
-        # Messages were wrong: zero and contact angle are where they were, and known as well.
-        shift_zero(s, -went)
-        s.away_s = 1e9
-        known = sqrt(s.known_before / before) if before > s.known_before else 1.0
-        for i in range(STATES):
-            s.covariance[CONTACT, i] *= known
-            s.covariance[i, CONTACT] *= known
-        # What these messages said of the motion had turned friction over.
-        s.angle, s.slid_angle = s.angle_then, s.slid_then
-        s.friction_state, s.friction_variance = s.friction_then, s.friction_variance_then
-        s.contact.confirmed = s.confirmed_then
+def _move_zero(s, p, moved, sigma, back):
+    """Refer all stored angles to a zero that has moved by ``moved`` rad, known with standard deviation ``sigma`` rad;
+    ``back``: to where it was."""
+    a = s.away
+    if not may_come_back(s):
+        _remember_motion(s)
+    went = a.way
+    a.way += moved
+    a.variance += sq(sigma)
+    if back or abs(a.way) < _SURELY * sqrt(a.variance) < abs(went):
+        _restore_motion(s, went)
         return
+    s.drifted = s.stood_s = 0.0
+    s.strayed = np.nan
     shift_zero(s, moved)
     s.covariance[CONTACT, CONTACT] += sq(s.gear_slope * sigma)
     open_again(s, p)
     s.contact.confirmed = False
+
+
+@njit
+def may_come_back(s: Record) -> bool:
+    """Whether the zero has just moved, and some messages may have been wrong."""
+    return s.away.seconds < _AWAY_S
+
+
+@njit
+def _remember_motion(s):
+    """Keep what is believed before the zero moves."""
+    a = s.away
+    a.way = a.variance = a.seconds = 0.0
+    a.known, a.confirmed = s.covariance[CONTACT, CONTACT], s.contact.confirmed
+    a.believed = s.drifting_s == 0.0 and s.plausibility.verdict == AGREE
+    a.angle, a.speed, a.slid = s.angle, s.speed, s.slid_angle
+    a.friction, a.friction_variance = s.friction_state, s.friction_variance
+    a.strayed, a.turned, a.stood = s.strayed, s.turned, s.stood_s
+
+
+@njit
+def _restore_motion(s, went):
+    """Some messages were wrong: the zero, which they moved by ``went`` rad, is where it was, and the motor has not turned
+    friction over as they said."""
+    a, before = s.away, s.covariance[CONTACT, CONTACT]
+    shift_zero(s, -went)
+    known = sqrt(a.known / before) if before > a.known else 1.0
+    for i in range(STATES):
+        s.covariance[CONTACT, i] *= known
+        s.covariance[i, CONTACT] *= known
+    s.angle, s.speed, s.slid_angle = a.angle, a.speed, a.slid
+    s.friction_state, s.friction_variance = a.friction, a.friction_variance
+    s.strayed, s.turned, s.stood_s = a.strayed, a.turned, a.stood
+    s.contact.confirmed = a.confirmed
+    if a.believed:
+        s.drifting_s = 0.0
+        believe_resolver(s.plausibility)
+    a.seconds = 1e9
 
 
 @njit

@@ -17,7 +17,7 @@ from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
 from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_friction, doubt_memory, stiffness_path, torque_path
-from emb_daemon.estimator.resolver import MOST_SLIP_RAD, SPEED_MARGIN, at_rest, believe_speed, follow_zero
+from emb_daemon.estimator.resolver import MOST_SLIP_RAD, SPEED_MARGIN, at_rest, believe_speed, follow_zero, may_come_back
 from emb_daemon.estimator.rewind import forget_stroke, go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
@@ -100,7 +100,7 @@ def _start(s, p, m):
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
-    s.torque_age = s.no_current_s = s.away_s = 1e9
+    s.torque_age = s.no_current_s = s.away.seconds = 1e9
     open_all(s, p)
     forget_common(s)
     if s.resumed:
@@ -179,10 +179,11 @@ def _advance(s, p, m, angle, speed, out):
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)
     torque, leverage, friction_variance = torque_path(s, p, m)
-    if moved_zero or other_speed:
+    doubtful = may_come_back(s)
+    if moved_zero or other_speed or doubtful:
         torque = np.nan
     # Over a gap the current of its last cycle does not belong to the mean acceleration.
-    if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown and aligned(s.alignment):
+    if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown and aligned(s.alignment) and not doubtful:
         watch_contact(s, p, m, force_before, torque, leverage)
     turning_sigma, standing_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
     out.stiffness_force = s.force
