@@ -337,28 +337,28 @@ def test_what_another_estimator_made_is_made_anew(tmp_path, logs, calibration, m
 
 
 def _fleet(rng):
-    """Units of three batches with scatter that is large in some directions, and prints of causes."""
+    """Units of three batches with scatter that is large in some directions, and signatures of causes."""
     units, size, causes = 60, 6, 12
     spread = np.diag(10.0 ** rng.uniform(-1.0, 0.5, size))
     turn = np.linalg.qr(rng.standard_normal((size, size)))[0]
     values = rng.standard_normal((units, size)) @ spread @ turn
-    prints = rng.standard_normal((causes, size))
+    signatures = rng.standard_normal((causes, size))
     batch = np.arange(units) % 3
-    return values, prints, {f"batch {n}": batch == n for n in range(3)}, {"batch": batch}
+    return values, signatures, {f"batch {n}": batch == n for n in range(3)}, {"batch": batch}
 
 
-def _read(values, prints, factors, noise=0.1, freedom=1000):
-    centre = population.centres(values, factors)
+def _read(values, signatures, factors, noise=0.1, freedom=1000):
+    centre = population.find_centres(values, factors)
     covariance = np.broadcast_to(noise**2 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
-    return centre, population.Readings(values, centre, prints, covariance, np.full(len(values), freedom))
+    return centre, population.Readings(values, centre, signatures, covariance, np.full(len(values), freedom))
 
 
 def test_what_a_batch_shares_is_found_with_its_cause_and_size():
     for seed in range(5):
-        values, prints, groups, factors = _fleet(np.random.default_rng(seed))
-        values[groups["batch 1"]] += 3.0 * prints[4]
-        values[groups["batch 2"]] -= 2.0 * prints[7]
-        found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
+        values, signatures, groups, factors = _fleet(np.random.default_rng(seed))
+        values[groups["batch 1"]] += 3.0 * signatures[4]
+        values[groups["batch 2"]] -= 2.0 * signatures[7]
+        found = population.find_shared_causes(values, groups, _read(values, signatures, factors)[1], against_others=True)
         assert {(one.where, one.cause) for one in found} == {("batch 1", 4), ("batch 2", 7)}
         for one in found:
             truth = 3.0 if one.cause == 4 else -2.0
@@ -370,12 +370,12 @@ def test_what_a_wrong_shape_leaves_is_no_second_cause():
     named."""
     for seed in range(5):
         for second, named in ((0.2, {4}), (1.0, {4, 9})):
-            values, prints, groups, factors = _fleet(np.random.default_rng(seed))
-            covariance = np.linalg.inv(_read(values, prints, factors)[1].inverse)
+            values, signatures, groups, factors = _fleet(np.random.default_rng(seed))
+            covariance = np.linalg.inv(_read(values, signatures, factors)[1].inverse)
             # As far from each other, and from others, as causes can be.
-            prints[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
-            values[groups["batch 1"]] += prints[4] + second * prints[9]
-            found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
+            signatures[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
+            values[groups["batch 1"]] += signatures[4] + second * signatures[9]
+            found = population.find_shared_causes(values, groups, _read(values, signatures, factors)[1], against_others=True)
             assert {one.cause for one in found} == named and {one.where for one in found} == {"batch 1"}, (seed, second)
 
 
@@ -383,24 +383,24 @@ def test_where_nothing_is_shared_nobody_is_accused():
     """60 fleets of healthy units: of all accusations one in a hundred fleets may be false, and of units one in a hundred."""
     batches = units = 0
     for seed in range(60):
-        values, prints, groups, factors = _fleet(np.random.default_rng(1000 + seed))
-        centre, readings = _read(values, prints, factors)
-        batches += bool(population.shared_causes(values, groups, readings, beside=True))
-        units += bool(population.outliers(values - centre, readings))
+        values, signatures, groups, factors = _fleet(np.random.default_rng(1000 + seed))
+        centre, readings = _read(values, signatures, factors)
+        batches += bool(population.find_shared_causes(values, groups, readings, against_others=True))
+        units += bool(population.find_outliers(values - centre, readings))
     # Binomial, 0.1 %.
     assert batches <= 5 and units <= 5
 
 
 def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
-    values, prints, _, factors = _fleet(np.random.default_rng(3))
-    values[10] += 12.0 * prints[2]
-    values[20] -= 12.0 * prints[5]
-    centre, readings = _read(values, prints, factors)
-    found = population.outliers(values - centre, readings)
+    values, signatures, _, factors = _fleet(np.random.default_rng(3))
+    values[10] += 12.0 * signatures[2]
+    values[20] -= 12.0 * signatures[5]
+    centre, readings = _read(values, signatures, factors)
+    found = population.find_outliers(values - centre, readings)
     assert {(one.where, one.cause): one.amount for one in found} == pytest.approx({(10, 2): 12.0, (20, 5): -12.0}, rel=0.2)
     # Were its own drives as far apart, it would be none.
-    centre, readings = _read(values, prints, factors, noise=20.0)
-    assert population.outliers(values - centre, readings) == []
+    centre, readings = _read(values, signatures, factors, noise=20.0)
+    assert population.find_outliers(values - centre, readings) == []
 
 
 def test_a_unit_whose_few_drives_happen_to_agree_is_not_accused():
@@ -408,15 +408,15 @@ def test_a_unit_whose_few_drives_happen_to_agree_is_not_accused():
     scatter most lie far out, and as many of all seem sure of it. Known from a thousand drives, the same is an accusation."""
     rng, accused = np.random.default_rng(0), {3: 0, 1000: 0}
     for _ in range(20):
-        _, prints, _, factors = _fleet(rng)
+        _, signatures, _, factors = _fleet(rng)
         true = np.where(np.arange(60) % 3 == 0, 4.0, 1.0)
         values = true[:, None] * rng.standard_normal((60, 6))
         told = true**2 * rng.chisquare(3, 60) / 3.0
-        centre = population.centres(values, factors)
+        centre = population.find_centres(values, factors)
         noise = told[:, None, None] * np.eye(6)
         for freedom in accused:
-            readings = population.Readings(values, centre, prints, noise, np.full(60, freedom))
-            accused[freedom] += bool(population.outliers(values - centre, readings))
+            readings = population.Readings(values, centre, signatures, noise, np.full(60, freedom))
+            accused[freedom] += bool(population.find_outliers(values - centre, readings))
     assert accused[3] <= 1 and accused[1000] > 5, accused
 
 
@@ -426,7 +426,7 @@ def test_what_a_workshop_could_not_confirm_is_not_reported(monkeypatch):
     own.keys, own.masks = [("a", "FL"), ("b", "FL")], {"batch A": np.ones(2, bool)}
     own.causes, own.directions = [SimpleNamespace(name="", key="", shape="", unit="")], SimpleNamespace(size_N=np.ones(1))
     found = [population.Difference(row, 0, size_N, 1.0, 1e-9, ()) for row, size_N in enumerate((-35.0, -37.0))]
-    monkeypatch.setattr(findings, "outliers", lambda *_: found)
+    monkeypatch.setattr(findings, "find_outliers", lambda *_: found)
     assert [one.where for one in own._outliers(np.zeros(0), None, lambda _: "")] == ["b FL"]
     shared = [population.Difference("batch A", 0, size_N, 1.0, 1e-9, ()) for size_N in (9.0, -11.0)]
     assert [one.size_N for one in own._list_shared(shared, lambda _: "")] == [-11.0]
@@ -436,13 +436,13 @@ def test_random_effects_take_each_units_own_noise_out():
     rng = np.random.default_rng(0)
     sigmas = rng.uniform(0.5, 3.0, 4000)
     truth = rng.normal(10.0, 1.5, len(sigmas))
-    found = population.random_effects(truth + sigmas * rng.standard_normal(len(sigmas)), sigmas)
+    found = population.estimate_random_effects(truth + sigmas * rng.standard_normal(len(sigmas)), sigmas)
     assert found.mean == pytest.approx(10.0, abs=5.0 * found.sigma)
     assert found.spread == pytest.approx(1.5, rel=0.1)
 
 
 def test_units_that_differ_by_their_noise_alone_have_no_spread():
-    found = population.random_effects(np.array([1.0, 1.1, 0.9]), np.full(3, 1.0))
+    found = population.estimate_random_effects(np.array([1.0, 1.1, 0.9]), np.full(3, 1.0))
     assert found.spread == 0.0
 
 
@@ -467,7 +467,7 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
     for _ in range(400):
         from_drive_to_drive = 0.3 * rng.standard_normal((4, 4))
         drives = _scores(rng, "u", lambda number, own=from_drive_to_drive: truth + own[number], 4)
-        units.append(population.unit_of(drives, flat, np.ones((4, 1)), [np.eye(4)]))
+        units.append(population.fit_unit(drives, flat, np.ones((4, 1)), [np.eye(4)]))
     values, noise = np.array([unit.values[0] for unit in units]), np.array([np.diag(unit.noise[0]) for unit in units])
     np.testing.assert_allclose(values.mean(axis=0) / 50.0, truth, atol=0.03)
     np.testing.assert_allclose(noise.mean(axis=0), values.var(axis=0), rtol=0.15)
@@ -475,14 +475,14 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
 
 def test_who_asks_twice_as_many_questions_is_half_as_sure():
     """The same causes listed twice tell nothing new of anybody: each is its twin's rival."""
-    values, prints, groups, factors = _fleet(np.random.default_rng(3))
-    values[10] += 12.0 * prints[2]
-    values[groups["batch 1"]] += 3.0 * prints[4]
-    chances, count = [], len(prints)
-    for causes, rivals in ((prints, ((), ())), (np.concatenate([prints, prints]), ((2 + count,), (4 + count,)))):
+    values, signatures, groups, factors = _fleet(np.random.default_rng(3))
+    values[10] += 12.0 * signatures[2]
+    values[groups["batch 1"]] += 3.0 * signatures[4]
+    chances, count = [], len(signatures)
+    for causes, rivals in ((signatures, ((), ())), (np.concatenate([signatures, signatures]), ((2 + count,), (4 + count,)))):
         centre, readings = _read(values, causes, factors)
-        [unit] = [one for one in population.outliers(values - centre, readings) if one.where == 10]
-        batch = population.shared_causes(values, groups, readings, beside=True)[0]
+        [unit] = [one for one in population.find_outliers(values - centre, readings) if one.where == 10]
+        batch = population.find_shared_causes(values, groups, readings, against_others=True)[0]
         chances.append((unit.chance, batch.chance))
         assert (unit.rivals, batch.rivals) == rivals
     np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
@@ -491,11 +491,11 @@ def test_who_asks_twice_as_many_questions_is_half_as_sure():
 
 def test_a_unit_is_measured_by_the_scatter_of_others():
     """By its own, it would excuse itself."""
-    values, prints, _, factors = _fleet(np.random.default_rng(4))
-    centre, readings = _read(values, prints, factors)
-    values[7] += 3.0 * prints[1]
+    values, signatures, _, factors = _fleet(np.random.default_rng(4))
+    centre, readings = _read(values, signatures, factors)
+    values[7] += 3.0 * signatures[1]
     noise = np.broadcast_to(0.01 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
-    again = population.Readings(values, centre, prints, noise, np.full(len(values), 1000))
+    again = population.Readings(values, centre, signatures, noise, np.full(len(values), 1000))
     np.testing.assert_allclose(again.filters[7], readings.filters[7], rtol=1e-9)
     assert np.abs(again.filters[8] / readings.filters[8] - 1.0).max() > 1e-3
 
@@ -629,14 +629,14 @@ def test_a_slope_is_of_what_changes_within_units_wherever_they_are():
     drives = [_scores(rng, f"unit-{number}", lambda drive: np.zeros(4), 12) for number in range(6)]
     flat = population.Directions(np.eye(4) / np.sqrt(200.0) / 50.0, np.eye(4), np.ones(4))
     warmth = [place + 0.3 * rng.standard_normal(12) for place in (-2.0, -2.0, 0.0, 0.0, 2.0, 2.0)]
-    assert population.changing(drives, flat, warmth).shape == (4, 4)
+    assert population.find_slope_directions(drives, flat, warmth).shape == (4, 4)
 
 
 def test_a_cause_that_is_mostly_a_level_of_others_has_no_slope():
-    prints = np.array([[1.0, 0.0], [1.0, 1.0], [0.1, 1.0]])
-    directions = population.Directions(np.eye(2), prints, np.ones(3))
-    np.testing.assert_array_equal(directions.prints_in(np.array([[1.0], [0.0]])), [[1.0], [1.0], [0.0]])
-    np.testing.assert_array_equal(directions.prints_in(np.eye(2)), prints)
+    signatures = np.array([[1.0, 0.0], [1.0, 1.0], [0.1, 1.0]])
+    directions = population.Directions(np.eye(2), signatures, np.ones(3))
+    np.testing.assert_array_equal(directions.signatures_in(np.array([[1.0], [0.0]])), [[1.0], [1.0], [0.0]])
+    np.testing.assert_array_equal(directions.signatures_in(np.eye(2)), signatures)
 
 
 # -- end to end -------------------------------------------------------------------------------------------------------
