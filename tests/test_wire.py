@@ -17,7 +17,7 @@ from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import MODES, REASONS, REQUESTS, RESULTS, reason_words
 from emb_daemon.wire.e2e import crc, protect
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE, row_of
-from emb_daemon.wire.layout import CORNERS, _concerning, default_layout, load_layout, pack, unpack
+from emb_daemon.wire.layout import CORNERS, _restrict, default_layout, load_layout, pack, unpack
 from emb_daemon.wire.receive import (
     ACCEPTED,
     BAD_COUNTER,
@@ -278,7 +278,7 @@ def test_corners_that_are_not_ours_are_foreign():
     assert _receive(frame("EMB_FL_ClampForce"), new_reception(), layout)[1] == IGNORED
     assert _receive(frame("EMB_FR_Resolver"), new_reception(), layout)[1] == ACCEPTED
     # As out of that of all corners, which a compiled library holds.
-    assert _concerning(("FR",), default_layout().copy()).tobytes() == layout.tobytes()
+    assert _restrict(default_layout().copy(), ("FR",)).tobytes() == layout.tobytes()
 
 
 def test_a_repeated_frame_is_refused_and_the_next_taken(heard):

@@ -54,7 +54,7 @@ _NOT_SHARED = [0xFFFF] * 4 + [0xFFFFFFFF]
 
 def _judge(memory, reasons, times=3, corner=FL, mode=DEGRADED, frame=_FRAME):
     for _ in range(times):
-        memory.judge(corner, mode, reasons, frame, 0.0)
+        memory.evaluate(corner, mode, reasons, frame, 0.0)
     return [memory.entries[code_of(corner, bit)] for bit in range(len(REASONS))]
 
 

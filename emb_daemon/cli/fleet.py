@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     return _COMMANDS[arguments.fleet_command][0](arguments)
 
 
-def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list, failed: Callable | None = None) -> list:
+def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list, failed: Callable) -> list:
     """``task`` of every item on the cluster, with a bar on a terminal."""
     from emb_daemon.fleet.cluster import cluster
     from emb_daemon.fleet.cluster import run as run_on

@@ -307,7 +307,7 @@ def _verify(frames, links, places, known):
             known[count] = frame
             count += 1
         elif place.which < 0:
-            count = _judge(links[place.link], frame.time_ns, frame.data, known, count)
+            count = _authenticate(links[place.link], frame.time_ns, frame.data, known, count)
         else:
             count = _hold(links[place.link], place.which, place.position, frame, known, count)
     return count
@@ -329,7 +329,7 @@ def _hold(link, which, position, frame, known, count):
 
 
 @njit
-def _judge(link, time_ns, data, known, count):
+def _authenticate(link, time_ns, data, known, count):
     """Pass on the frames that an authentication frame proves authentic, or refuse it."""
     number = np.int64(data >> np.uint64(16) & np.uint64(15))
     which = _SETS if number == FRESHNESS_SET else number
