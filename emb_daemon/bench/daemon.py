@@ -172,7 +172,7 @@ def main() -> None:
     realtime = setup.configuration.realtime
     measures = list(set_up(realtime.lock_memory, realtime.fifo_priority, realtime.cpu))
     settle_memory()
-    # Including the CPU time of a process that compiled beside this one.
+    # Including the CPU time of child processes, one of which may have compiled.
     print("ready", sum(os.times()[:4]), flush=True)
     daemon.run()
     gc.enable()

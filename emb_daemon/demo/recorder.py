@@ -77,7 +77,7 @@ class Recorder:
         self.count += room
 
     def present(self, now_ns: int) -> list[Corner]:
-        """The corners as the monitor knows them from their broadcasts so far, with the true force as reference."""
+        """The corners as the monitor has them from the broadcasts so far, with the true force as reference."""
         # The car drives on while the frames are read: the reference is that of the last of them.
         count, forces = self.count, self.truth["force"][self.cycles - 1]
         self._listener.hear(self.frames[self._listened : count])

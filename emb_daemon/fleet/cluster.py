@@ -83,8 +83,8 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
                     with contextlib.suppress(TimeoutError):
                         client.wait_for_workers(count, timeout=_PATIENCE_S)
         finally:
-            # Results are in files. A worker that could not be closed, or that died before distributed had heard of its start,
-            # ends with this process.
+            # Results are in files. A worker that could not be closed, or that died before distributed registered it, ends with
+            # this process.
             with contextlib.suppress(AssertionError, KeyError):
                 local.close()
 

@@ -132,7 +132,7 @@ def fit_unit(scores: Sequence[Score], directions: Directions, covariates: np.nda
 
 
 def estimate_scatter(units: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scatter of ordinary units: robust mean (q,) and covariance (q, q) of most rows, (N, q), whatever the others are.
+    """Scatter of ordinary units: robust mean (q,) and covariance (q, q) of most rows, (N, q), independent of the others.
 
     Concentration steps of the minimum covariance determinant (Rousseeuw, Van Driessen, Technometrics 41, 1999) from medians,
     then once more with all rows that are not outliers. The covariance is drawn towards ``noise``, that of one row by its own
@@ -340,8 +340,8 @@ def _fit_together(
 
 def find_outliers(deviations: np.ndarray, readings: Readings) -> list[Difference]:
     """Units that differ from their group, shape (N, q) about its centre, largest difference first. The difference must exceed
-    both the scatter between units and that between the unit's own drives, each as well as it is known: ten drives tell a
-    scatter to a quarter, and of many units one has it from drives that happen to agree."""
+    both the scatter between units and that between the unit's own drives, each with its degrees of freedom: ten drives
+    determine a scatter to a quarter, and among many units there is one whose drives happen to agree."""
     from scipy.stats import false_discovery_control
     from scipy.stats import t as student
 

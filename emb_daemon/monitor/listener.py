@@ -36,8 +36,8 @@ class Stream:
 
     Attributes:
         values: signals of the last good frame in the DBC's order and units; empty before the first.
-        received, missing, damaged: good frames; frames missing by the counter, whose complete turns the time tells; frames
-        with a wrong CRC or a repeated counter.
+        received, missing, damaged: good frames; frames missing by the counter, complete turns of which show in the elapsed
+        time; frames with a wrong CRC or a repeated counter.
     """
 
     cycle_ns: int
@@ -55,7 +55,7 @@ class Stream:
         return self.status <= contract.STATUS_DEGRADED
 
     def value(self, column: int) -> float | None:
-        """A signal of the last good frame; None before the first, or if the sender says not to use it."""
+        """A signal of the last good frame; None before the first, or if the Status forbids its use."""
         return self.values[column] if self.values and self.usable else None
 
     def take(self, values: list[float], status: int, counter: int, time_ns: int) -> bool:
@@ -65,8 +65,8 @@ class Stream:
             if step == 0 and elapsed < COUNTER_MODULO / 2:
                 self.damaged += 1
                 return False
-            # Complete turns of the counter show only in the elapsed time, and only of a sender that kept its schedule
-            # meanwhile: one that stood still has sent no more than its counter says.
+            # Complete turns of the counter show only in the elapsed time, and only if the sender kept its schedule: a sender
+            # that paused has not sent more frames than its counter shows.
             turns = max(0, round((elapsed - step) / COUNTER_MODULO))
             if abs(elapsed - step - COUNTER_MODULO * turns) <= _JITTER_CYCLES:
                 step += COUNTER_MODULO * turns

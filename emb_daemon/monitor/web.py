@@ -41,7 +41,7 @@ class Web:
     """Serves one page, its events and metrics, to this machine only.
 
     Args:
-        port: 0 for any that is free; `port` says which.
+        port: 0 for any that is free; it is then the attribute `port`.
         title: name of the bus on the page.
     """
 

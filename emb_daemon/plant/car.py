@@ -126,7 +126,7 @@ def _corner_cycle(p, s, mode, target, rate, wheel_speed, wheel_gain, ambient, rn
     s.mean_current = current / SUBSTEPS
     # Ornstein-Uhlenbeck noise of the current sensor at four points of the cycle, averaged as the sensor does.
     decay = np.exp(-0.25 * CYCLE_S / p.current_noise_time)
-    # Variance of the mean of four such values, a quarter of a cycle apart, as a share of theirs.
+    # Variance of the mean of four such values, a quarter of a cycle apart, as a share of the variance of one.
     averaged = (4.0 + 6.0 * decay + 4.0 * decay**2 + 2.0 * decay**3) / 16.0
     spread = p.current_noise * np.sqrt((1.0 - decay * decay) / averaged)
     error = 0.0

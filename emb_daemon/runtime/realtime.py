@@ -1,4 +1,4 @@
-"""Real-time set-up of the process; each measure says what it did or why it could not."""
+"""Real-time set-up of the process; each measure reports what it did or why it could not."""
 
 import ctypes
 import gc

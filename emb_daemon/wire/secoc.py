@@ -1,4 +1,4 @@
-"""Secure onboard communication: proves who sent a message, and that it is not an old one played back.
+"""Secure onboard communication: proves that a message is from its sender, and that it is not a replayed one.
 
 AUTOSAR SecOC in the form of its profile 1 (AES-128-CMAC, truncated; 8 bits of freshness on the wire), as a secured PDU
 collection with message linking, because resolver and current leave no room in their frames: an authentication frame follows
