@@ -130,7 +130,7 @@ def test_the_last_minute_keeps_its_peaks():
     assert len(line) == 20 and line.count("█") == 1
 
 
-def test_silence_is_said():
+def test_silence_is_shown():
     shown = "\n".join(_text(_hear(_force(0)), now_ns=107 * S))
     assert "SILENT for 7 s" in shown
 
@@ -173,7 +173,7 @@ def test_a_script_gets_json_from_a_bus(capsys):
     assert list(corners) == ["FL"] and corners["FL"]["clamp_force_kN"] == 5.0 and corners["FL"]["forces_per_s"] > 0
 
 
-def test_nobody_there_is_said_and_the_status_is_1(capsys, monkeypatch):
+def test_without_broadcasts_the_status_is_1_with_a_message(capsys, monkeypatch):
     monkeypatch.setattr("emb_daemon.monitor.terminal._WAIT_S", 0.2)
     assert main(["monitor", "-i", "virtual", "-c", "nobody", "--once"]) == 1
     error = capsys.readouterr().err

@@ -110,7 +110,7 @@ def test_page_state_and_metrics_are_served(web):
     assert _get(web.port, "/etc/passwd").status == 404
 
 
-def test_a_name_of_somebody_else_that_leads_here_gets_nothing(web):
+def test_a_request_under_a_foreign_host_name_is_refused(web):
     assert _get(web.port, "/state.json", host="rebound.example").status == 403
     assert _get(web.port, "/state.json", host="localhost").status == 200
 
@@ -121,7 +121,7 @@ def test_it_is_served_on_one_address_alone(web):
         socket.create_connection(("127.0.0.2", web.port), timeout=5.0)
 
 
-def test_a_taken_port_is_told(web, capsys):
+def test_a_taken_port_is_reported(web, capsys):
     assert main(["monitor", "-i", "virtual", "-c", "web-taken", "--web", str(web.port)]) == 1
     assert capsys.readouterr().err == f"--web {web.port}: Address already in use\n"
     for nowhere in ("nowhere", "127.0.0.1:65536"):
@@ -180,7 +180,7 @@ def test_datagrams_and_events_follow_the_broadcasts():
     assert len(history) >= 2 and set(history[-1][1]) == {"FL"} and history[0][0] < history[-1][0]
 
 
-def test_what_was_heard_is_recorded(tmp_path):
+def test_received_broadcasts_are_recorded(tmp_path):
     pytest.importorskip("mcap", reason="NOT RUN: mcap is not installed")
     from mcap.reader import make_reader
 

@@ -218,7 +218,7 @@ def test_after_a_gap_time_is_what_passed(car, gap):
 
 
 @pytest.mark.parametrize("held_ms", [20, 35, 45])
-def test_a_frame_held_up_on_its_way_changes_nothing(car, held_ms):
+def test_delayed_frames_change_no_estimate(car, held_ms):
     """A burst after a hold-up: the counter says what passed, the clock does not, though it may be closer to another turn."""
     frames = _log()
     late = frames.copy()
@@ -232,7 +232,7 @@ def test_a_frame_held_up_on_its_way_changes_nothing(car, held_ms):
     assert np.array_equal(plain["cycle"], answered["cycle"]) and np.array_equal(plain["force"], answered["force"])
 
 
-def test_a_sender_that_paused_is_believed_to_have_paused(car):
+def test_the_pause_of_a_sender_is_made_up_for(car):
     """20 ms without a frame and a counter that goes on as if nothing were: the time is made up for one sample later."""
     frames = np.concatenate(_sliding(60))
     paused = frames["time_ns"] >= frames["time_ns"][len(frames) // 2]
