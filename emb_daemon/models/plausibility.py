@@ -105,19 +105,8 @@ def watch(
         The verdict, also kept in ``c.verdict``.
     """
     travel = m.angle - angle_before
-    step = travel - turned
     delay = _DELAY_S * abs(m.speed)
-    c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
-    if abs(step) > _ALIKE_RAD + delay:
-        c.alike = 0
-    elif abs(travel) > _STANDS_RAD:
-        c.alike += 1
-    c.still = c.still + 1 if travel == 0.0 and m.speed == speed_before else 0
-    if m.has_current:
-        c.idle = c.idle + 1 if m.current_q == c.current else 0
-        c.current_flickered += c.idle == 0
-        c.current = m.current_q
-        _look_for_limit(c, m.current_q, travel)
+    _count_repetitions(c, m, travel, travel - turned, delay, speed_before)
     was = c.verdict
     if was == STIFFNESS_WRONG:
         c.frozen_s += m.dt
@@ -148,6 +137,23 @@ def watch(
     else:
         c.verdict = UNDECIDED
     return c.verdict
+
+
+@njit
+def _count_repetitions(c, m, travel, step, delay, speed_before):
+    """Update what is known of each sensor alone: how long it repeats its value, and whether angle and speed agree. ``travel``
+    rad of the angle, ``step`` rad beyond the integrated speed, ``delay`` rad that a late angle explains."""
+    c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
+    if abs(step) > _ALIKE_RAD + delay:
+        c.alike = 0
+    elif abs(travel) > _STANDS_RAD:
+        c.alike += 1
+    c.still = c.still + 1 if travel == 0.0 and m.speed == speed_before else 0
+    if m.has_current:
+        c.idle = c.idle + 1 if m.current_q == c.current else 0
+        c.current_flickered += c.idle == 0
+        c.current = m.current_q
+        _look_for_limit(c, m.current_q, travel)
 
 
 @njit

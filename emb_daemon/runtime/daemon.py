@@ -350,17 +350,18 @@ class Daemon:
 
     def _answer_to(self, request: Request) -> Answer | None:
         """Change to a page that was read, all of its corners in one tick, or refuse it; None while the decision is open."""
-        now_ns, answer = time.monotonic_ns(), Answer(request.fault)
+        now_ns, answer = time.monotonic_ns(), Answer()
         request.read_ns = request.read_ns or now_ns
-        if not request.fault:
-            if request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
-                answer = Answer("checking it took too long", later=True)
-            elif self._waiting:
-                answer = Answer("a reload is waiting for the brakes to be released", later=True)
-            elif request.read and (why_not := self.pipeline.why_not_at_rest()):
-                if now_ns - request.read_ns < _SETTLING_NS:
-                    return None
-                answer = Answer(why_not, later=True)
+        if request.fault:
+            answer = Answer(request.fault)
+        elif request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
+            answer = Answer("checking it took too long", later=True)
+        elif self._waiting:
+            answer = Answer("a reload is waiting for the brakes to be released", later=True)
+        elif request.read and (why_not := self.pipeline.why_not_at_rest()):
+            if now_ns - request.read_ns < _SETTLING_NS:
+                return None
+            answer = Answer(why_not, later=True)
         if answer.refused:
             log.error("page refused: %s", answer.refused)
             return answer
