@@ -66,7 +66,7 @@ class PythonCanBus:
             to one just sent is taken for its echo.
     """
 
-    def __init__(self, bus: PythonCan, ids: list[int], echoes: bool):
+    def __init__(self, bus: PythonCan, ids: list[int], echoes: bool = False):
         self._bus = bus
         # python-can's own filters are not used: where it applies them in software, recv(0) returns None for a frame that
         # they leave out, as for an empty queue.
@@ -133,16 +133,21 @@ class PythonCanBus:
         return True
 
     def send(self, frames: np.ndarray) -> None:
+        for frame in frames:
+            message = message_of(frame)
+            if self._hand_over(message) and self._echoes is not None:
+                self._echoes.append((message.arbitration_id, bytes(message.data)))
+
+    def _hand_over(self, message: "Message") -> bool:
+        """Whether the bus has accepted a message; counted if not."""
         import can
 
-        for message in map(message_of, frames):
-            try:
-                self._bus.send(message)
-            except can.CanError:
-                self.unsent += 1
-                continue
-            if self._echoes is not None:
-                self._echoes.append((message.arbitration_id, bytes(message.data)))
+        try:
+            self._bus.send(message)
+        except can.CanError:
+            self.unsent += 1
+            return False
+        return True
 
     def close(self) -> None:
         self._bus.shutdown()
