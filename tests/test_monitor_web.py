@@ -41,7 +41,7 @@ def _broadcasts(now_ns: int, counter: int, force_kN=5.0, status=0, reasons=0, co
 
 def _heard(**what) -> Listener:
     listener = Listener()
-    listener.hear(_broadcasts(100 * SECOND_NS, 0, **what))
+    listener.receive(_broadcasts(100 * SECOND_NS, 0, **what))
     return listener
 
 
@@ -77,7 +77,7 @@ def test_lost_and_damaged_frames_are_counted_apart():
     listener = _heard()
     late = _broadcasts(100 * SECOND_NS, 4)
     late["data"][1] ^= 1 << 60
-    listener.hear(late)
+    listener.receive(late)
     found = _samples(exposition(listener, 100 * SECOND_NS))
     # Three of each of the other kinds of message were lost before these, and one came with a wrong CRC.
     assert found["emb_frames_missing_total", 'corner="FL"'] == 9.0
@@ -188,7 +188,7 @@ def test_received_broadcasts_are_recorded(tmp_path):
 
     recording, listener = Recording(tmp_path / "drive.mcap"), Listener()
     for counter in range(3):
-        listener.hear(_broadcasts(100 * SECOND_NS, counter, 5.0 + counter, reasons=1))
+        listener.receive(_broadcasts(100 * SECOND_NS, counter, 5.0 + counter, reasons=1))
         listener.corners[0].facts = [None, [], ["the disc is uneven"]][counter]
         for _ in range(2):  # Nothing new the second time.
             recording.show(listener, 100 * SECOND_NS)

@@ -476,7 +476,7 @@ class Parked:
             payload |= pack(float(value), layout["sent"][ADAPT_REQUEST, column])
         frames[0] = (0, protect(can_id, payload, self.counter, 0), can_id, 8, 0)
         self.counter = (self.counter + 1) % COUNTER_MODULO
-        self.car.hear(frames)
+        self.car.receive(frames)
 
 
 @pytest.fixture

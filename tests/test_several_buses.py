@@ -207,7 +207,7 @@ def test_simulate_and_monitor_take_a_mapping(tmp_path, capsys):
     force = int(wirekit.frame("EMB_FL_ClampForce", 0, ClampForce=5.0, ClampForceSigma=0.1)["data"][0])
     broadcast.send(can.Message(0.0, 0x200, False, data=force.to_bytes(8, "little")))
     listener = Listener()
-    listener.hear(monitor.drain())
+    listener.receive(monitor.drain())
     now = time.monotonic_ns()
     state = listener.corners[0].state(now)
     assert state["clamp_force_kN"] == 5.0 and abs(state["clamp_force_ref_kN"]) < 0.2

@@ -163,7 +163,7 @@ def hand_out(bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool
         bus.wait(_HEAR_S)
         # Pause after the first frame, to take all frames of a period together.
         time.sleep(_HEAR_S)
-        listener.hear(bus.drain())
+        listener.receive(bus.drain())
         now = time.monotonic_ns()
         if shared:
             shared.follow(now)

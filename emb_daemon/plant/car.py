@@ -326,7 +326,7 @@ def _run(w, rng, commands, drives, frames, truth):
 
 
 @njit
-def _hear(w, frames):
+def _receive(w, frames):
     """Read adaptation requests from the frames on the bus."""
     wires = w.wires[0]
     signals = wires.sent[wire.ADAPT_REQUEST]
@@ -431,6 +431,6 @@ class Car:
         count = _run(self._world, self._rng, commands, drives, frames, truth)
         return frames[:count].copy(), truth
 
-    def hear(self, frames: np.ndarray) -> None:
+    def receive(self, frames: np.ndarray) -> None:
         """Receive the daemon's frames: EMB_c_AdaptRequest starts and ends training motion."""
-        _hear(self._world, frames)
+        _receive(self._world, frames)

@@ -149,7 +149,7 @@ class Diagnostics:
         frames = self._bus.drain()
         # Only the newest frame of each message is used, which is five times less work.
         _, newest = np.unique(frames["can_id"][::-1], return_index=True)
-        self.listener.hear(frames[::-1][newest])
+        self.listener.receive(frames[::-1][newest])
         for data in payloads_to(self._request_id, frames):
             self._requests.append(self._message(arbitration_id=self._request_id, data=data))
         now = time.monotonic()
