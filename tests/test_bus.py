@@ -89,7 +89,7 @@ def virtual():
     theirs.shutdown()
 
 
-def test_one_drain_takes_all_that_is_there_whatever_lies_between(virtual):
+def test_one_drain_returns_all_waiting_frames_past_those_that_do_not_concern_it(virtual):
     ours, theirs = virtual
     for number in range(20):
         theirs.send(can.Message(arbitration_id=0x555, data=bytes(8), is_extended_id=False))
@@ -157,7 +157,7 @@ def test_command_line_before_environment_before_configuration(monkeypatch):
     assert _options("-c can3", configured)["channel"] == "can3"
 
 
-def test_can_conf_counts_where_nothing_else_is_said(monkeypatch):
+def test_options_that_are_not_given_come_from_can_conf(monkeypatch):
     there = {"interface": "virtual", "channel": f"test_bus rc {os.getpid()}"}
     monkeypatch.setattr(can, "rc", there)
     bus = open_bus(**_options(""), ids=_OURS)

@@ -208,7 +208,7 @@ def test_shapes_and_relations(tmp_path, pattern, value, expected):
         (b"#" * 4_000_001, "larger than 4000000 bytes"),
     ],
 )
-def test_what_is_no_calibration_at_all(tmp_path, content, expected):
+def test_files_that_are_not_calibrations_are_refused_with_the_fault(tmp_path, content, expected):
     path = tmp_path / "calibration.yaml"
     path.write_bytes(content)
     with pytest.raises(InputErrors) as caught:
@@ -255,7 +255,7 @@ _number = st.floats(allow_nan=False, allow_infinity=False)
 @given(st.builds(_Everything, text=_words, number=_number, whole=st.integers(), flag=st.booleans(),
                  numbers=st.lists(_number, max_size=4).map(tuple),
                  table=st.dictionaries(_words, st.dictionaries(_words, _number, max_size=2), max_size=2)))  # fmt: skip
-def test_what_is_written_is_read(tmp_path_factory, value):
+def test_any_dumped_value_is_read_back_equal(tmp_path_factory, value):
     """Through the calibration's own dumper: any text, also one that looks like a number, any finite number."""
     assert load_yaml(_file(tmp_path_factory, dump_calibration(value)), _Everything) == value
 

@@ -403,7 +403,7 @@ def test_two_outlying_units_are_both_found():
     assert population.find_outliers(values - centre, readings) == []
 
 
-def test_a_unit_whose_few_drives_agree_by_chance_is_no_outlier():
+def test_noise_estimated_from_few_drives_makes_no_outliers():
     """Healthy units that differ by their noise alone, each of which knows it from four drives: twenty of those whose drives
     scatter most lie far out, and as many of all seem sure of it. Known from a thousand drives, the same is an accusation."""
     rng, accused = np.random.default_rng(0), {3: 0, 1000: 0}
@@ -590,7 +590,7 @@ def test_a_thermal_cause_has_a_season_only_in_a_batch():
         assert ("all units", cause) in {(o.where, o.cause) for o in findings.find(fleet, plain, "", factors, {}).seasons}
 
 
-def test_a_season_whose_rival_is_a_thermal_cause_is_no_finding():
+def test_a_season_that_a_thermal_misfit_explains_as_well_is_no_finding():
     """The first cause makes nearly the second one's force, so a misfit of the model's heat may look like either."""
     rng, fleet = np.random.default_rng(8), {}
     for number in range(16):

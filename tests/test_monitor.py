@@ -212,7 +212,7 @@ def test_the_demo_is_the_monitor_with_the_truth_beside_it(width, height):
     assert any("simulated truth" in line for line in lines) and ("info: ready" in lines) == (height > 24)
 
 
-def test_the_truth_beside_an_estimate_is_of_its_moment(monkeypatch):
+def test_the_reference_is_the_true_force_at_the_time_of_the_frames(monkeypatch):
     """While frames are read the car drives on; 60 ms of a stroke would look like an error of 3 kN."""
     recorder, truth = Recorder(("FL",), 1.0), np.zeros(1, TRUTH)
     truth["force"] = 10_000.0

@@ -206,7 +206,7 @@ def test_received_broadcasts_are_recorded(tmp_path):
     assert all(kinds[type(value)] in described[name]["type"] for name, value in said.items())
 
 
-def test_what_the_daemon_shares_is_followed(tmp_path, monkeypatch, capsys):
+def test_monitor_passes_the_shared_file_to_page_and_recording(tmp_path, monkeypatch, capsys):
     taken = []
     monkeypatch.setattr("emb_daemon.monitor.web.hand_out", lambda *given: taken.append(given))
     bus, path = ["-i", "virtual", "-c", "web-shared"], tmp_path / "estimates"

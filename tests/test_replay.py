@@ -150,7 +150,7 @@ def test_an_output_that_is_an_input_is_refused(two_corners, capsys, monkeypatch,
 
 
 @pytest.mark.parametrize("option", ["--report", "--output"])
-def test_what_is_no_regular_file_is_not_replaced(two_corners, capsys, option):
+def test_pipes_links_to_them_and_folders_are_not_replaced(two_corners, capsys, option):
     """A pipe stands for devices here: root could replace /dev/null, and a link to one."""
     pipe, link = two_corners / "pipe.csv", two_corners / "link.csv"
     os.mkfifo(pipe)

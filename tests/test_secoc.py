@@ -221,7 +221,7 @@ def estimates_of(frames, pipeline=None):
 NUMBERS = ("cycle", "counter", "force", "sigma", "stiffness_force", "torque_force", "contact_angle", "disc", "mean", "mode")
 
 
-def test_what_stands_on_the_wire():
+def test_authentication_frames_decode_by_the_dbc():
     """By the DBC and other people's codecs: freshness first, then each set's authentication, with its Counter."""
     frames = signed()
     decoded = [wirekit.decode(frame) for frame in frames[np.isin(frames["can_id"], [AUTH, FRESHNESS])][:300]]
@@ -504,7 +504,7 @@ class TestFreshnessFile:
     def test_a_trip_counter_is_used_once(self, tmp_path):
         assert [FreshnessFile(tmp_path / "state").begin_trip().trip for _ in range(3)] == [1, 2, 3]
 
-    def test_it_outlives_a_restart_with_what_was_heard(self, tmp_path):
+    def test_after_a_restart_stored_freshness_refuses_played_back_frames(self, tmp_path):
         first = opened(tmp_path)
         assert not first.stale(), "nothing was heard yet"
         first.verify(signed())
@@ -514,13 +514,13 @@ class TestFreshnessFile:
         second = opened(tmp_path)
         assert fresh(second.verify(signed()))[0] == 0 and fresh(second.verify(signed(trip=2)))[0] == len(drive())
 
-    def test_what_was_heard_of_a_corner_that_is_left_out_for_a_while_is_not_forgotten(self, tmp_path):
+    def test_freshness_of_a_corner_that_is_not_configured_now_is_kept(self, tmp_path):
         file = FreshnessFile(tmp_path)
         file.keep(Freshness(heard={"EMB_RR_Auth": (7, 9)}))
         opened(tmp_path).close()
         assert "EMB_RR_Auth" not in [link.name for link in RECEIVED] and file.load().heard["EMB_RR_Auth"] == (7, 9)
 
-    def test_a_bus_that_is_heard_for_long_keeps_what_it_heard(self, tmp_path):
+    def test_received_freshness_is_stored_while_the_bus_runs(self, tmp_path):
         frames, bus = signed(), SimpleNamespace()
         authentication = opened(tmp_path)
         secured_bus = SecuredBus(bus, authentication)
@@ -533,7 +533,7 @@ class TestFreshnessFile:
         authentication._writer.join()
         assert FreshnessFile(tmp_path).load().heard["EMB_FL_Auth"][0] == 1
 
-    def test_one_thread_at_a_time_stores(self, tmp_path, monkeypatch):
+    def test_only_one_thread_stores_freshness_at_a_time(self, tmp_path, monkeypatch):
         """And none where logs are read; what the first had not heard the last one stores."""
         authentication, held, stored = opened(tmp_path), threading.Event(), []
         monkeypatch.setattr(authentication._file, "keep", lambda kept: (held.wait(20.0), stored.append(kept)))
@@ -684,7 +684,7 @@ def configured(folder, lines):
 
 
 class TestConfiguration:
-    def test_faults_of_keys_are_told_with_the_others(self, tmp_path):
+    def test_a_missing_key_file_is_an_error_of_the_configuration(self, tmp_path):
         with pytest.raises(InputError, match="keys: no such file"):
             Setup(configured(tmp_path, "secoc: {keys: keys}\n"))
 

@@ -83,7 +83,7 @@ def test_dbc_states_the_contract(name, can_id, cycle, signals):
         assert found.byte_order == "little_endian" and found.comment and found.receivers
 
 
-def test_dbc_states_what_numbers_mean():
+def test_the_dbc_names_the_values_of_enumerations():
     def choices(message, signal):
         found = wirekit.database().get_message_by_name(message).get_signal_by_name(signal)
         return {number: str(name) for number, name in found.choices.items()}
@@ -150,7 +150,7 @@ def test_pack_is_that_of_cantools_inside_the_range(data):
     assert not int(payload) & ~mask and not (theirs ^ empty) & ~mask
 
 
-def test_one_count_beyond_its_range_a_number_is_refused():
+def test_a_value_one_count_beyond_its_range_is_refused():
     tried = 0
     for name in _RECEIVED:
         message = wirekit.database().get_message_by_name(name)
@@ -348,7 +348,7 @@ def test_a_restarted_sender_is_accepted_if_its_second_frame_comes_half_a_cycle_l
     assert verdict == (ACCEPTED if believed else BAD_COUNTER)
 
 
-def test_what_is_accepted_does_not_depend_on_when_the_clock_began():
+def test_acceptance_of_frames_does_not_depend_on_the_clocks_zero():
     """A million frames into a drive and years after a start: late, early, lost, repeated and foreign ones."""
     rng, verdicts = np.random.default_rng(7), []
     late_ns, counters = (

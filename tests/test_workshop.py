@@ -93,7 +93,7 @@ def test_a_confirmed_code_is_forgotten_after_cycles_without_failure(tmp_path):
     assert not entry.status & (CONFIRMED | PENDING) and entry.frame is None
 
 
-def test_a_cycle_in_which_nothing_was_judged_does_not_count(tmp_path):
+def test_an_operation_cycle_without_a_test_does_not_age_a_code(tmp_path):
     _judge(TroubleMemory(tmp_path), CURRENT_LOST)
     for _ in range(5):
         entry = TroubleMemory(tmp_path).entries[code_of(FL, 1)]
@@ -198,7 +198,7 @@ class _Sharing:
             self.present.follow(self.now_ns)
 
 
-def test_of_each_corner_the_newest_sample_is_told_while_it_is_of_the_present(tmp_path):
+def test_the_newest_sample_of_each_corner_is_available_for_as_long_as_it_is_current(tmp_path):
     sharing = _Sharing(tmp_path / "estimates")
     for row in (_row(torque_force=1.0), _row(RR, torque_force=2.0), _row(torque_force=3.0), _row(is_sample=False)):
         sharing.tell(row)
@@ -235,7 +235,7 @@ def test_the_reason_for_missing_estimates_is_reported_when_it_lasts(tmp_path, co
 
 
 @given(st.binary(min_size=1, max_size=12))
-def test_any_request_has_one_answer_or_a_reason(tmp_path_factory, request_):
+def test_any_request_gets_one_positive_or_negative_response(tmp_path_factory, request_):
     server = Server(TroubleMemory(tmp_path_factory.mktemp("trouble")), {0x1000: lambda: b"abc"})
     response = server.answer(request_, 0.0)
     if not response:
@@ -386,7 +386,7 @@ def test_a_tester_reads_versions_calibration_and_estimates(served):
     assert client.read_data_by_identifier(0x1120).service_data.values[0x1120] == b"not known"
 
 
-def test_what_a_daemon_shares_goes_to_the_corner_that_it_is_of(served, tmp_path):
+def test_shared_estimates_are_assigned_to_their_corner(served, tmp_path):
     server, client = served
     found, later = TABLE["zero_wanders"].sentence + "; " + TABLE["beyond_range"].sentence, time.monotonic_ns() + 10**12
     facts = sum(1 << bit for bit, name in enumerate(TABLE) if name in ("zero_wanders", "beyond_range"))

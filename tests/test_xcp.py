@@ -104,7 +104,7 @@ def test_every_row_is_taken_once_and_in_order_or_counted_as_lost(tmp_path_factor
     assert len(taken) + missing == loop.rows
 
 
-def test_a_reader_that_keeps_up_loses_nothing_and_a_late_one_gets_the_count(tmp_path):
+def test_a_late_reader_gets_the_number_of_estimates_that_it_lost(tmp_path):
     loop, reader = _Loop(tmp_path / "estimates"), EstimatesReader(tmp_path / "estimates")
     reader.look()
     for _ in range(20):
@@ -244,7 +244,7 @@ class _Acquisition(RuleBasedStateMachine):
         assert self.slave.acquiring or not sent
 
 
-def test_acquisition_in_any_order_sends_nothing_that_no_frame_carries():
+def test_acquisition_commands_in_any_order_keep_the_state_machines_invariants():
     run_state_machine_as_test(_Acquisition, settings=settings(max_examples=40, stateful_step_count=30, deadline=None))
 
 
