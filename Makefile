@@ -8,14 +8,14 @@ READY = $(VENV)/.ready
 demo: $(READY)
 	$(VENV)/bin/emb-daemon demo
 
-# As many processes as cores: threads of linear algebra beside them would only wait for each other.
-# Byte code is kept whatever the shell says, or a hundred processes would each translate the sources.
+# One process per core; further threads of linear algebra would only wait for a core. Byte code is written even if the shell
+# forbids it: otherwise each of a hundred processes compiles the sources.
 PYTEST = OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/pytest -q -rs -n auto --maxprocesses 4 \
 	--dist loadfile --no-loadscope-reorder
 test: $(READY) lint
 	$(PYTEST) -m "not trial"
 
-# All kernels compiled ahead, whole campaigns identified, whole drives diagnosed. Each has a short form in make test.
+# Long tests: all kernels compiled ahead, whole campaigns identified, whole drives diagnosed. make test has a short form of each.
 trials: $(READY)
 	$(PYTEST) -m trial
 
@@ -69,16 +69,16 @@ MUTANTS ?= 60
 mutation: $(READY)
 	$(VENV)/bin/python tests/mutation.py $(MUTANTS)
 
-# Is the estimate ever silently wrong? A short form for CI: one drive of each family whose promises are kept; fails if one is not.
-# All of it, 900 drives with one fault and 100 with two: $(VENV)/bin/python -m studies.silent grid
+# Fails if an estimate is wrong beyond its stated uncertainty without a flag: one drive of each kind of fault that the
+# documentation promises to flag. All 900 drives with one fault and 100 with two: $(VENV)/bin/python -m studies.silent grid
 SILENT ?= nominal,torque_constant,friction_scale,viscous,resolver_frozen_last,current_frozen,current_zero,current_lost,$\
 thermocouple_stuck,thermocouple_stuck_noise,ambient_cold,power_cycle,bursts_lost,$\
 current_offset,power_on_hot,wheel_pulses_pause,stribeck,start_latched,gear_wear,wheel_speed_zero
 silent: $(READY)
 	$(VENV)/bin/python -m studies.silent grid --faults $(SILENT) --count 1 --processes 1 --strict
 
-# What the box installs, as CycloneDX, and what is known to be wrong with it. audit fails too where its data cannot be reached:
-# "could not be audited" is no "nothing found".
+# Packages that the daemon's computer installs, as CycloneDX, and their known vulnerabilities. audit also fails if the database
+# of vulnerabilities cannot be reached.
 SUPPLY = build/supply/bin
 $(SUPPLY)/pip-audit:
 	$(PYTHON) -m venv build/supply
@@ -92,7 +92,8 @@ sbom: $(SUPPLY)/pip-audit
 audit: $(SUPPLY)/pip-audit
 	$(SUPPLY)/pip-audit --strict --disable-pip --require-hashes -r requirements-box.lock
 
-# A simulated fleet of 200 units for 30 days, three batches and ten units of which have secrets: are they found, and no others?
+# A simulated fleet of 200 units for 30 days: fails unless the effects of three batches and nine of ten faulty units are found,
+# with at most one wrong finding.
 FLEET_SEED ?= 1
 fleet: $(READY)
 	$(VENV)/bin/python -m studies.fleet --seed $(FLEET_SEED)
@@ -106,8 +107,7 @@ lint: $(READY)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 
-# Fails unless every public name has a known type. The checker brings its own node; it finds the package through the first
-# python of the path.
+# Fails unless every public name has a known type. pyright examines the package of the first python in PATH.
 TYPES = build/types/bin
 $(TYPES)/pyright:
 	$(PYTHON) -m venv build/types

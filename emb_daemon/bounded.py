@@ -7,7 +7,7 @@ from pathlib import Path
 
 from emb_daemon.errors import InputErrors
 
-#: Taken from a file that says to be smaller, as those of /proc do.
+#: Bytes that are read at least: files of /proc state a size of zero.
 _UNKNOWN_SIZE = 1 << 20
 
 
@@ -28,7 +28,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 
 
 def read_input(path: Path, most_bytes: int) -> bytes:
-    """`read_bounded` of a file that the user named; raises InputErrors for whatever is wrong with it."""
+    """`read_bounded` of a file that the user named; raises InputErrors if it cannot be read."""
     try:
         return read_bounded(path, most_bytes)
     except FileNotFoundError:

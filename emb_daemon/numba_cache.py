@@ -35,7 +35,7 @@ def _cache_folder() -> Path:
     folder = _cache_root() / installed_digest()
     try:
         for each in (folder.parent, folder):
-            # Whatever the umask: who else may write to it may have what he likes executed.
+            # Independent of the umask: whoever can write to it can have any code executed by this process.
             each.mkdir(0o755, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             trouble = who_else_writes(folder)

@@ -338,7 +338,7 @@ def _complete(b, index, count):
     corner.sample_ns = now
     corner.predicted = 0
     corner.pending = -1
-    _head(b, row, index, corner.predicted)
+    _head(b, row, index, 0)
     return count + 1
 
 

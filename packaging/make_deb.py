@@ -25,7 +25,7 @@ MACHINES = {
     "aarch64": ("arm64", ("manylinux_2_28_aarch64", "manylinux2014_aarch64")),
 }
 _HOME = "opt/emb_daemon"
-#: Files of the project, or folders of them, and where they go; what is in /etc is the administrator's (conffiles).
+#: Files of the project, and the folders into which they are installed; those in /etc become conffiles, which an update keeps.
 _FILES = {
     "config/emb.yaml": "etc/emb_daemon",
     "config/calibration.yaml": "etc/emb_daemon",
@@ -39,24 +39,24 @@ _FILES = {
 
 
 def system_python() -> str:
-    """Debian's Python, as 3.11."""
+    """Version of Debian's Python, like "3.11"."""
     code = "import sys; print('%d.%d' % sys.version_info[:2])"
     return subprocess.run(["/usr/bin/python3", "-c", code], capture_output=True, text=True, check=True).stdout.strip()
 
 
 def fetch_packages(site: Path, machine: str, python: str) -> None:
-    """What the daemon depends on, as wheels with the lock's hashes."""
+    """Install the daemon's dependencies, checked against the hashes of the lock file, into ``site``."""
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--require-hashes",
                "--no-deps", "--no-compile", "--only-binary=:all:", "--implementation=cp", f"--python-version={python}",
                f"--abi=cp{python.replace('.', '')}", "--abi=abi3", "--abi=none", f"--target={site}",
                *(f"--platform={name}" for name in MACHINES[machine][1]), "-r", ROOT / "requirements-ahead.lock"]  # fmt: skip
     subprocess.run(command, check=True)
-    # Scripts of theirs that nobody calls, for the Python that fetched them.
+    # Scripts that nobody calls; they would start the Python that runs pip here.
     shutil.rmtree(site / "bin", ignore_errors=True)
 
 
 def lay_out(root: Path, wheel: Path, kernels: Path, python: str) -> None:
-    """Everything but what the daemon depends on, below ``root``."""
+    """Put everything but the dependencies below ``root``."""
     home, site = root / _HOME, site_of(root, python)
     site.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(wheel) as archive:
@@ -79,12 +79,12 @@ def lay_out(root: Path, wheel: Path, kernels: Path, python: str) -> None:
 
 
 def site_of(root: Path, python: str) -> Path:
-    """Where packages are."""
+    """The folder of Python packages below ``root``."""
     return root / _HOME / "lib" / f"python{python}" / "site-packages"
 
 
 def compile_bytecode(root: Path) -> None:
-    """The service cannot write what Python would keep; it is for files as they are, whatever their times."""
+    """Compile all modules, because the service cannot write bytecode; Python uses it without comparing times of files."""
     command = ["/usr/bin/python3", "-m", "compileall", "-q", "-s", root, "-p", "/", "--invalidation-mode", "unchecked-hash",
                root / _HOME / "lib"]  # fmt: skip
     subprocess.run(command, check=True)
@@ -109,13 +109,13 @@ def pack(root: Path, version: str, architecture: str, python: str, folder: Path)
     for name in ("postinst", "prerm", "postrm"):
         shutil.copy(ROOT / "packaging/debian" / name, debian)
         (debian / name).chmod(0o755)
-    # Nobody else may write what the daemon executes; the umask of who makes it does not count.
+    # Only root can write files that the daemon executes, whatever the umask here.
     for path in root.rglob("*"):
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() or path.stat().st_mode & 0o100 else 0o644)
     root.chmod(0o755)
     package = folder / f"emb-daemon_{version}_{architecture}.deb"
-    # A ninth larger than at the best level, in half of its minute.
+    # Level 3 takes half a minute instead of a minute at the best level, and makes the package a ninth larger.
     subprocess.run(
         ["dpkg-deb", "--root-owner-group", "-Zxz", "-z3", "--build", root, package], check=True, stdout=subprocess.DEVNULL
     )
@@ -126,20 +126,20 @@ def make(wheel: Path, machine: str, python: str) -> Path:
     """The package for a machine, beside the wheel."""
     with tempfile.TemporaryDirectory() as name:
         root, kernels = Path(name, "root"), Path(name, "kernels.so")
-        # In this process: what is compiled for one machine is only emitted anew for the next.
+        # Called in this process: kernels compiled for one machine need only be emitted again for the next.
         if emb_daemon(["compile", "--target", machine, "--output", str(kernels)]):
             sys.exit(1)
         fetch_packages(site_of(root, python), machine, python)
         lay_out(root, wheel, kernels, python)
         if read_manifest(kernels).sources != source_digest(site_of(root, python) / "emb_daemon"):
-            sys.exit(f"{wheel}: of other sources than {ROOT}; make wheel")
+            sys.exit(f"{wheel}: was built from other sources than {ROOT}; run make wheel")
         compile_bytecode(root)
         return pack(root, wheel.name.split("-")[1], MACHINES[machine][0], python, wheel.parent)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Debian packages, in the wheel's folder.")
-    parser.add_argument("wheel", type=Path, help="of the project")
+    parser.add_argument("wheel", type=Path, help="the project's wheel")
     parser.add_argument("--machine", nargs="+", choices=MACHINES, default=["x86_64"])
     arguments = parser.parse_args()
     for machine in arguments.machine:

@@ -38,7 +38,7 @@ from studies.strangers import draw_stranger
 FAMILIES = faults.FAMILIES | unlisted.FAMILIES
 #: The park brake is applied this long, s: settling, a stroke of the car's 20 s and the daemon's evaluation fit into it.
 _PARK_S = 34.0
-#: Cycles of a stretch: training ends if the car does not hear the daemon for 25.
+#: Cycles of a stretch: training ends if the car receives no request of the daemon for 25.
 _STRETCH = 20
 #: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet.
 _POWER_ON_S = 0.5
@@ -261,7 +261,7 @@ def drive(
             if any(begin <= time_s < end for begin, end in silences):
                 continue
             answers, sent = daemon.answer(fault.bus(frames, time_s))
-            car.hear(sent)
+            car.receive(sent)
             estimates[count : count + len(answers)] = answers
             count += len(answers)
     estimates = estimates[:count]

@@ -82,7 +82,7 @@ def live(memory: Memory, calibration: Calibration, pads_mm: float, night: int = 
     commands = commands_of(schedule, (_CORNER,))
     for row in range(len(schedule)):
         _, count = pipeline.consume(car.tick(commands[row], schedule.drives[row]))
-        car.hear(pipeline.broadcast(count))
+        car.receive(pipeline.broadcast(count))
         if pipeline.estimates["adapt_result"][:count].any():
             break
     adaptation.close(pipeline.states, pipeline.parameters)

@@ -54,7 +54,7 @@ def _measure(port: int, share: Path, stop: threading.Event, packets: list[int]) 
         with suppress(TimeoutError):
             master.measure(MEASURED)
             while not stop.is_set():
-                master.hear()
+                master.receive()
     packets.append(sum(master.packets.values()))
     master.close()
 

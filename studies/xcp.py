@@ -54,12 +54,12 @@ class Master:
         self._socket.send(struct.pack("<HH", len(packet), self._sent & 0xFFFF) + packet)
         self._sent += 1
         while True:
-            if response := self.hear():
+            if response := self.receive():
                 if response[0] != 0xFF:
                     raise RuntimeError(f"{packet.hex()} was answered by {response.hex()}")
                 return response
 
-    def hear(self) -> bytes:
+    def receive(self) -> bytes:
         """Take a datagram; returns the response in it, empty if there is none."""
         datagram, response = self._socket.recv(65536), b""
         while datagram:
@@ -153,7 +153,7 @@ def _judge(port: int, share: Path, seconds: float) -> int:
     master.measure(MEASURED)
     begin, first = time.monotonic(), int(written[0])
     while time.monotonic() - begin < seconds:
-        master.hear()
+        master.receive()
     rows = int(written[0]) - first
     master.ask("BB", 0xDD, 0)
     master.ask("B", 0xFE)

@@ -81,7 +81,7 @@ class ClosedLoop:
             frames = self.car.tick(commands[row], schedule.drives[row])
             _, count = self.pipeline.consume(frames if spoil is None else spoil(frames))
             answers = self.pipeline.broadcast(count)
-            self.car.hear(answers)
+            self.car.receive(answers)
             truths += self.car.truth.tobytes()
             estimates += self.pipeline.estimates[:count].tobytes()
             counts.append(count)

@@ -4,8 +4,8 @@ Run as ``python tests/mutation.py [COUNT] [SEED] [PART]``. COUNT mutants (60), o
 drawn from wire, estimator, models, adaptation, runtime and the evidence of discovery, and judged in the order drawn, so that
 a run that is ended early has judged a fair sample. Each is built into a copy of the package, which runs as plain Python:
 compiling a mutant takes longer than interpreting its tests. Every test runs once without a mutant first, which tells how long
-it takes and which functions it calls; a mutant meets those that call its function, quick ones first, until one fails.
-Each is printed with its line, and the test that failed or the number of those that did not.
+it takes and which functions it calls; a mutant is tried with those that call its function, quick ones first, until one fails.
+Each is printed with its line, and the test that failed or the number of tests that passed.
 """
 
 import ast
@@ -40,7 +40,7 @@ _TESTS = (
     "secoc", "snapshots", "stale_angle", "start", "status", "step", "stiffness", "training_fit", "training_rules", "uneven",
     "unknown", "wander", "wheel", "wire", "xcp",
 )  # fmt: skip
-#: What takes longest to import and is the same in every process.
+#: Libraries that take longest to import, imported once before processes are forked.
 _LIBRARIES = (
     "can", "cantools", "cryptography.hazmat.primitives.ciphers", "hypothesis", "msgspec", "numba", "rich", "scipy.optimize",
     "yaml",

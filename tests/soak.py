@@ -1,4 +1,4 @@
-"""The daemon with four corners for as long as asked: it goes on answering and its memory stays flat.
+"""The daemon with four corners for a given time: fails if samples are not answered or memory grows.
 
 Run as ``python tests/soak.py SECONDS``.
 """

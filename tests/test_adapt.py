@@ -273,7 +273,7 @@ def test_silence_ends_training(tmp_path):
 
 def test_a_controller_that_does_not_answer_is_not_pestered(tmp_path):
     loop = ClosedLoop(tmp_path)
-    loop.car.hear = lambda frames: None
+    loop.car.receive = lambda frames: None
     estimates, _ = loop.run(parked(40.0))
     asked = estimates["adapt_request"] == 1
     assert 0.004 * asked.sum() == pytest.approx(loop.calibration.adaptation.answer_time_s, abs=0.1)
@@ -291,7 +291,7 @@ def test_training_that_never_ends_is_ended(tmp_path):
     time_s = 0.004 * np.arange(len(schedule))
     schedule.commands["mode"] = 1
     schedule.commands["target"] = np.where(time_s > 8.0, 12.0 + np.sin(6.0 * time_s), 0.0)
-    loop.car.hear = lambda frames: None
+    loop.car.receive = lambda frames: None
     before = loop.parameters[0].copy()
     loop.run(schedule, until=lambda e: e["adapt_result"] != contract.NO_RESULT)
     assert loop.adaptation.adapters[0]["outcome"] == r.TOO_LONG

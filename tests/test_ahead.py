@@ -147,7 +147,7 @@ def test_nothing_is_needed_beyond_libc_and_libm(compiled):
         assert needed <= _LIBM | _LIBC, name
 
 
-def test_the_daemon_says_which_code_it_runs(compiled, tmp_path):
+def test_the_daemon_logs_which_code_it_runs(compiled, tmp_path):
     """Up to the point at which it finds no such interface."""
     config, path = aheadkit.ROOT / "config" / "emb.yaml", compiled / "kernels.so"
     arguments = ["run", "--config", config, "-i", "socketcan", "-c", "none0"]
@@ -166,7 +166,7 @@ def _sealed(path: Path, **changes) -> Path:
     return path
 
 
-def test_one_that_fits_is_accepted(tmp_path):
+def test_a_matching_library_is_accepted(tmp_path):
     assert check(_sealed(tmp_path / "kernels.so")).made_by == "a test"
 
 
@@ -178,7 +178,7 @@ def test_one_that_fits_is_accepted(tmp_path):
         ({"flags": ("avx4096",)}, "this processor has no avx4096"),
     ],
 )
-def test_one_that_does_not_fit_is_refused(tmp_path, changes, why):
+def test_a_library_that_does_not_match_is_refused(tmp_path, changes, why):
     with pytest.raises(Refused, match=why):
         check(_sealed(tmp_path / "kernels.so", **changes))
 
@@ -195,14 +195,14 @@ def test_one_that_does_not_fit_is_refused(tmp_path, changes, why):
         lambda whole: whole.replace(base64.b64encode(b"its layout"), base64.b64encode(b"Its layout")),
     ],
 )
-def test_one_that_is_damaged_is_refused(tmp_path, damage):
+def test_a_damaged_library_is_refused(tmp_path, damage):
     path = _sealed(tmp_path / "kernels.so")
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(Refused, match=r"incomplete|damaged"):
         check(path)
 
 
-def test_one_that_anybody_can_write_is_refused(tmp_path):
+def test_a_library_writable_by_anybody_is_refused(tmp_path):
     path = _sealed(tmp_path / "kernels.so")
     path.chmod(0o666)
     with pytest.raises(Refused, match="is writable by anybody"):
@@ -218,7 +218,7 @@ def test_one_that_anybody_can_write_is_refused(tmp_path):
     ("name", "members", "refused"),
     [("USER", [], False), ("USER", ["USER"], False), ("USER", ["other"], True), ("users", [], True)],
 )
-def test_one_that_a_group_with_others_can_write_is_refused(tmp_path, monkeypatch, folder, name, members, refused):
+def test_a_library_writable_by_a_shared_group_is_refused(tmp_path, monkeypatch, folder, name, members, refused):
     """A group with the user's own name has, on many systems, nobody else in it."""
     path, user = _sealed(tmp_path / "kernels.so"), pwd.getpwuid(os.geteuid()).pw_name
     place = tmp_path if folder else path
@@ -231,7 +231,7 @@ def test_one_that_a_group_with_others_can_write_is_refused(tmp_path, monkeypatch
     assert said.startswith(f"{place} is writable by a group with other users") if refused else said == ""
 
 
-def test_one_of_somebody_else_is_refused(tmp_path, monkeypatch):
+def test_a_library_of_another_user_is_refused(tmp_path, monkeypatch):
     path = _sealed(tmp_path / "kernels.so")
     if path.stat().st_uid == 0:
         os.chown(path, 1234, -1)
@@ -246,7 +246,7 @@ def _load(code: str = "", **variables) -> subprocess.CompletedProcess:
     return processkit.python("-c", code, **variables)
 
 
-def test_what_is_refused_is_told_and_numba_is_used(tmp_path):
+def test_a_refusal_is_reported_and_numba_is_used(tmp_path):
     path = _sealed(tmp_path / "kernels.so", sources="0123456789abcdef")
     done = _load(EMB_DAEMON_KERNELS=str(path))
     assert re.fullmatch(f"kernels of {path} are not used: it was made from other sources .* False\n", done.stdout), done.stderr
@@ -257,7 +257,7 @@ def test_what_is_refused_is_told_and_numba_is_used(tmp_path):
     assert done.stdout == f"kernels of {tmp_path / 'none.so'} are not used: No such file or directory False\n"
 
 
-def test_none_is_used_where_numba_has_begun_or_nobody_asks(tmp_path):
+def test_no_library_is_used_after_numba_or_if_switched_off(tmp_path):
     path = _sealed(tmp_path / "kernels.so")
     done = _load("import emb_daemon.jit", EMB_DAEMON_KERNELS=str(path))
     assert done.stdout == f"kernels of {path} are not used: this process has already loaded other kernels False\n", done.stderr
@@ -277,7 +277,7 @@ def _without_numba(*arguments) -> subprocess.CompletedProcess:
     return processkit.python("-c", code, EMB_DAEMON_KERNELS="")
 
 
-def test_on_a_box_without_numba_files_are_checked_and_what_needs_it_says_so():
+def test_without_numba_files_are_checked_and_other_commands_name_what_is_missing():
     config = str(aheadkit.ROOT / "config" / "emb.yaml")
     done = _without_numba("check", "--config", config)
     assert done.returncode == 0, done.stderr
@@ -299,7 +299,7 @@ def test_the_commands_of_the_documentation_are_understood():
         parser.parse_args(line.split())
 
 
-def test_without_a_linker_it_says_what_has_one(monkeypatch):
+def test_without_a_linker_the_message_names_packages(monkeypatch):
     from emb_daemon.ahead.build import linker_for
 
     assert linker_for(platform.machine())[0] == "cc", "not the compiler that knows where libm is"
@@ -313,7 +313,7 @@ def test_an_unknown_machine_is_wrong_usage():
     assert (done.returncode, done.stderr) == (2, "--target riscv64: expected x86_64 or aarch64\n")
 
 
-def test_a_manifest_says_what_was_sealed(tmp_path):
+def test_a_manifest_contains_what_was_sealed(tmp_path):
     manifest = read_manifest(_sealed(tmp_path / "kernels.so", flags=("sse4_2",)))
     assert isinstance(manifest, Manifest) and manifest.flags == ("sse4_2",)
 

@@ -76,7 +76,7 @@ def test_a_file_with_a_reserve_has_its_room_from_the_first(tmp_path, monkeypatch
     assert caught.value.filename == str(tmp_path / "none" / "a")
 
 
-def test_everybody_may_read_and_a_folder_must_be_there(tmp_path):
+def test_a_file_is_readable_by_all_and_its_folder_must_exist(tmp_path):
     write_atomically(tmp_path / "a", b"x")
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o644
     with pytest.raises(OSError):

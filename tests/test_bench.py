@@ -11,7 +11,7 @@ from emb_daemon.estimator.records import ESTIMATE
 from studies import speed
 
 
-def test_a_difference_is_told_by_its_size():
+def test_a_difference_is_stated_by_its_size():
     one = np.zeros(3, ESTIMATE)
     one["force"], one["innovation"] = 1000.0, np.nan
     assert speed.difference(one, one.copy()) == 0.0
@@ -99,7 +99,7 @@ def test_a_period_is_held_up_only_if_nothing_of_the_process_ran():
     assert not is_held_up(late_ns=3_900_000, worked_ns=20_000)
 
 
-def test_what_is_missing_is_said(figures):
+def test_missing_figures_are_reported(figures):
     """No cyclictest: the empty loop says what the machine needs to wake."""
     figures["loops"][0]["cyclictest"] = None
     figures["verdict"] = verdict(figures)

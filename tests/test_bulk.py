@@ -140,7 +140,7 @@ def test_a_blf_that_was_cut_off_is_read_up_to_there(tmp_path, monkeypatch, capsy
         assert len(frames) > 0.8 * len(whole) * (size - len(content) / 4) / len(content)
 
 
-def test_a_blf_that_was_cut_off_between_objects_is_said_to_be(tmp_path, capsys):
+def test_a_blf_cut_off_between_objects_is_reported(tmp_path, capsys):
     """In the header of its next container, or in one of which all but the end of its stream is there."""
     rng = np.random.default_rng(2)
     first, second = (_container(b"".join(_object(_CAN, rng, number) for number in range(9)), True) for _ in range(2))
@@ -248,7 +248,7 @@ def test_a_reader_of_mdf4_that_died_is_begun_anew(mdf):
     np.testing.assert_array_equal(read_frames(mdf), frames)
 
 
-def test_a_reader_of_mdf4_ends_with_who_asked_it(mdf):
+def test_a_reader_of_mdf4_ends_with_its_parent(mdf):
     """Killed, it can tell nobody."""
     code = f"""if True:
         import os, sys

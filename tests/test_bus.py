@@ -44,7 +44,7 @@ def _heard(bus, count: int) -> list[tuple[int, int]]:
     return [(int(can_id), int(data)) for can_id, data in heard]
 
 
-def test_own_frames_are_not_heard_and_those_of_others_are(ends):
+def test_own_frames_are_left_out_and_those_of_others_are_received(ends):
     ours, theirs = ends
     mine = np.concatenate([wirekit.frame("EMB_FL_ClampForce", counter=c, ClampForce=0.1 * c) for c in range(15)])
     foreign = np.concatenate([wirekit.frame("EMB_FL_ClampForce", counter=c, ClampForce=3.0) for c in range(3)])
@@ -55,7 +55,7 @@ def test_own_frames_are_not_heard_and_those_of_others_are(ends):
     assert _heard(ours, 3) == list(zip(foreign["can_id"].tolist(), foreign["data"].tolist(), strict=True))
 
 
-def test_a_frame_of_ours_that_comes_once_more_is_somebody_elses(ends):
+def test_an_own_frame_that_comes_twice_is_from_another_sender(ends):
     ours, theirs = ends
     mine = wirekit.frame("EMB_FL_ClampForce", ClampForce=5.0)
     ours.send(mine)
@@ -89,7 +89,7 @@ def virtual():
     theirs.shutdown()
 
 
-def test_one_drain_takes_all_that_is_there_whatever_lies_between(virtual):
+def test_one_drain_returns_all_waiting_frames_past_those_that_do_not_concern_it(virtual):
     ours, theirs = virtual
     for number in range(20):
         theirs.send(can.Message(arbitration_id=0x555, data=bytes(8), is_extended_id=False))
@@ -105,7 +105,7 @@ def test_error_frames_are_heard(virtual):
     assert ours.drain()["flags"].tolist() == [ERROR]
 
 
-def test_what_could_not_be_sent_is_counted_and_the_rest_goes_out(virtual, monkeypatch):
+def test_unsent_frames_are_counted_and_the_others_are_sent(virtual, monkeypatch):
     ours, theirs = virtual
     send = ours._bus.send
 
@@ -157,7 +157,7 @@ def test_command_line_before_environment_before_configuration(monkeypatch):
     assert _options("-c can3", configured)["channel"] == "can3"
 
 
-def test_can_conf_counts_where_nothing_else_is_said(monkeypatch):
+def test_options_that_are_not_given_come_from_can_conf(monkeypatch):
     there = {"interface": "virtual", "channel": f"test_bus rc {os.getpid()}"}
     monkeypatch.setattr(can, "rc", there)
     bus = open_bus(**_options(""), ids=_OURS)
@@ -167,7 +167,7 @@ def test_can_conf_counts_where_nothing_else_is_said(monkeypatch):
     bus.close()
 
 
-def test_the_kernel_lets_through_what_is_ours_and_nothing_else(monkeypatch):
+def test_the_kernel_filters_pass_our_ids_only(monkeypatch):
     """A filter passes a frame whose id is the filter's in the bits of its mask."""
     told, none = {}, SimpleNamespace(setsockopt=lambda _, option, value: told.update({option: value}), bind=lambda _: None)
     monkeypatch.setattr("emb_daemon.runtime.rawcan.socket.socket", lambda *_: none)

@@ -208,7 +208,7 @@ def test_shapes_and_relations(tmp_path, pattern, value, expected):
         (b"#" * 4_000_001, "larger than 4000000 bytes"),
     ],
 )
-def test_what_is_no_calibration_at_all(tmp_path, content, expected):
+def test_files_that_are_not_calibrations_are_refused_with_the_fault(tmp_path, content, expected):
     path = tmp_path / "calibration.yaml"
     path.write_bytes(content)
     with pytest.raises(InputErrors) as caught:
@@ -227,7 +227,7 @@ def test_what_is_no_file_holds_nobody_up(tmp_path):
 
 
 @given(st.text(max_size=200))
-def test_no_text_makes_the_reader_fall(tmp_path_factory, text):
+def test_no_text_crashes_the_reader(tmp_path_factory, text):
     with pytest.raises(InputErrors):
         load_yaml(_file(tmp_path_factory, text), Calibration)
 
@@ -255,7 +255,7 @@ _number = st.floats(allow_nan=False, allow_infinity=False)
 @given(st.builds(_Everything, text=_words, number=_number, whole=st.integers(), flag=st.booleans(),
                  numbers=st.lists(_number, max_size=4).map(tuple),
                  table=st.dictionaries(_words, st.dictionaries(_words, _number, max_size=2), max_size=2)))  # fmt: skip
-def test_what_is_written_is_read(tmp_path_factory, value):
+def test_any_dumped_value_is_read_back_equal(tmp_path_factory, value):
     """Through the calibration's own dumper: any text, also one that looks like a number, any finite number."""
     assert load_yaml(_file(tmp_path_factory, dump_calibration(value)), _Everything) == value
 
@@ -317,7 +317,7 @@ def _stiffness(*coefficients: list[float], **changes) -> Stiffness:
 
 
 @pytest.mark.parametrize("softer", [[300.0, 12.0], [100.0, 4.0], [60.0, 2.0], [10.0, 0.1]])
-def test_a_compliance_carried_on_beyond_the_measured_never_reaches_zero(softer):
+def test_an_extrapolated_compliance_never_reaches_zero(softer):
     """Straight on, these reciprocals cross zero: the coefficients would pass through infinity to the other sign."""
     curves = _stiffness([360.0, 15.0], softer).curves
     low, high = thickness_range(curves)
@@ -372,7 +372,7 @@ def test_a_curve_that_falls_before_the_largest_force_is_refused(coefficients, ex
         (r"(?m)^pad_thickness_mm:.*$", "pad_thickness_mm: 77.0", "pad_thickness_mm: 77.0 is too far"),
     ],
 )  # fmt: skip
-def test_ranges_that_contradict_each_other(tmp_path, pattern, value, expected):
+def test_contradicting_ranges_are_refused(tmp_path, pattern, value, expected):
     text, count = re.subn(pattern, value, _TEXT, count=1)
     assert count == 1
     (fault,) = _faults(tmp_path, text)
@@ -380,7 +380,7 @@ def test_ranges_that_contradict_each_other(tmp_path, pattern, value, expected):
 
 
 @pytest.mark.parametrize(("maximum_N", "training_N"), [(8000.0, 4800.0), (30000.0, 18000.0), (42000.0, 18000.0)])
-def test_training_asks_no_brake_for_more_than_it_has(maximum_N, training_N):
+def test_training_force_is_at_most_the_largest_force(maximum_N, training_N):
     calibration = moved(_CALIBRATION, {"stiffness.maximum_force_N": maximum_N}, checked=True)
     assert to_limits(calibration)["high_force"] == pytest.approx(training_N)
 

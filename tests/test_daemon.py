@@ -125,7 +125,7 @@ def test_every_sample_is_answered_as_replay_answers_the_log_of_the_bus(setup: Se
     np.testing.assert_array_equal(answers(heard), answers(pipeline.broadcast(count)))
 
 
-def test_silence_is_told_from_the_first_tick(setup: Setup):
+def test_missing_inputs_are_reported_from_the_first_tick(setup: Setup):
     with Running(setup) as running:
         frames = running.wait_for(lambda frames: np.sum(frames["can_id"] == CLAMP_FORCE_FL) > 3)
     data = frames["data"][frames["can_id"] == CLAMP_FORCE_FL]
@@ -157,7 +157,7 @@ def test_a_good_calibration_is_taken_and_a_bad_one_is_not(setup: Setup, tmp_path
         assert running.daemon.ticks > ticks, "the loop stood still meanwhile"
 
 
-def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp_path: Path):
+def test_the_service_manager_gets_ready_watchdog_and_stopping(setup: Setup, tmp_path: Path):
     path = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(path)
@@ -177,7 +177,7 @@ def test_the_service_manager_hears_ready_watchdog_and_stopping(setup: Setup, tmp
         assert messages[-1] == b"STOPPING=1"
 
 
-def test_a_ping_that_was_withheld_is_made_up_for_soon(setup: Setup, monkeypatch):
+def test_after_a_withheld_ping_the_next_decision_comes_early(setup: Setup, monkeypatch):
     """A loop that only stalled is not ended for it: a quarter of the time to the next ping."""
     asked, manager = [], ServiceManager(environment={})
     manager.watchdog_s = 5.0
@@ -188,7 +188,7 @@ def test_a_ping_that_was_withheld_is_made_up_for_soon(setup: Setup, monkeypatch)
     assert 0.4 < again < then
 
 
-def test_the_service_manager_is_told_the_state_again_and_again(setup: Setup, monkeypatch):
+def test_the_service_manager_gets_the_state_repeatedly(setup: Setup, monkeypatch):
     monkeypatch.setattr("emb_daemon.runtime.daemon._STATUS_NS", 20_000_000)
     manager, told = ServiceManager(environment={}), []
     manager.notify = lambda *assignments: told.extend(assignments)
@@ -197,7 +197,7 @@ def test_the_service_manager_is_told_the_state_again_and_again(setup: Setup, mon
     assert told[1] == "STATUS=waiting for inputs" and told[2].startswith("STATUS=") and told[2].endswith("frames dropped")
 
 
-def test_a_stop_keeps_what_is_known_at_that_moment(setup: Setup, drive, tmp_path: Path):
+def test_a_stop_stores_the_state_of_that_moment(setup: Setup, drive, tmp_path: Path):
     with Running(setup, state=tmp_path) as running:
         for frames in drive[:200]:
             running.send(frames)
@@ -243,13 +243,13 @@ class TestPacer:
         pacer.note_arrival(0, 1_000_000)
         assert 1_000_000 + CYCLE_NS < pacer.next_wake(1_000_001) < 1_000_000 + CYCLE_NS + 500_000
 
-    def test_corners_that_come_together_are_answered_together(self):
+    def test_samples_that_arrive_together_are_answered_together(self):
         pacer = Pacer(1_000_000)
         pacer.note_arrival(0, 1_000_000)
         pacer.note_arrival(1, 1_100_000)
         assert pacer.next_wake(1_100_001) >= 1_100_000 + CYCLE_NS
 
-    def test_corners_apart_are_answered_apart(self):
+    def test_samples_that_arrive_apart_are_answered_apart(self):
         pacer = Pacer(1_000_000)
         pacer.note_arrival(0, 1_000_000)
         pacer.note_arrival(1, 3_000_000)
@@ -261,7 +261,7 @@ class TestPacer:
         pacer.last_tick_ns = 9 * CYCLE_NS
         assert pacer.next_wake(9 * CYCLE_NS + 1) <= 10 * CYCLE_NS + 500_000
 
-    def test_who_is_four_cycles_late_is_waited_for_no_more(self):
+    def test_a_corner_four_cycles_late_is_not_waited_for(self):
         pacer = Pacer(0)
         pacer.note_arrival(0, 0)
         pacer.last_tick_ns = now = 4 * CYCLE_NS
@@ -320,14 +320,14 @@ def test_each_whole_period_that_a_tick_is_late_is_a_missed_one(setup: Setup, lat
     assert (daemon.ticks, daemon.missed) == (1, missed)
 
 
-def test_a_watchdog_is_ours_unless_it_is_another_process_s():
+def test_the_watchdog_of_another_process_is_ignored():
     for pid, timeout in ((None, 3.0), (os.getpid(), 3.0), (1, None)):
         environment = {"WATCHDOG_USEC": "3000000"} | ({} if pid is None else {"WATCHDOG_PID": str(pid)})
         assert ServiceManager(environment).watchdog_s == timeout
     assert ServiceManager({}).watchdog_s is None
 
 
-def test_a_scan_tells_who_was_estimated_when_from_what_and_whose_state_is_no_number():
+def test_a_scan_returns_estimated_lost_and_changed_corners():
     """Of RL's and FR's sample and RR's prediction; a sample is complete with its later message."""
     pipeline = Pipeline(Setup(CONFIG / "emb.yaml").parameters, CORNERS)
     rows, states, times = pipeline.estimates[:3], pipeline.states, pipeline.receptions
@@ -378,7 +378,7 @@ def test_the_watchdog_is_pinged_while_every_corner_is_estimated_and_most_ticks_a
         assert pinged(100, 0)
 
 
-def test_a_service_managers_socket_may_have_a_name_of_the_kernels():
+def test_the_notify_socket_may_be_abstract():
     """That begins with @ in the environment, and with a zero byte for the kernel (unix(7))."""
     name = f"emb-daemon-test-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:

@@ -108,11 +108,11 @@ def test_the_site_builds(tmp_path):
     assert found["clamp: force?"] and not found["xyzzy"]
 
 
-def test_the_changelog_knows_this_version():
+def test_the_changelog_contains_this_version():
     assert f"## {__version__}" in (_ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
-def test_every_file_of_tests_has_something_that_is_no_trial(request):
+def test_every_test_file_has_a_test_that_is_no_trial(request):
     if request.config.option.file_or_dir or request.config.option.keyword:
         pytest.skip("only some of the tests were asked for")
     quick = {item.path for item in request.session.items if "trial" not in item.keywords}

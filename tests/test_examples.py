@@ -26,7 +26,7 @@ def _run(name: str, *arguments, **environment: str) -> str:
     return result.stdout
 
 
-def test_running_a_log_is_replaying_it(rig):
+def test_run_equals_replay(rig):
     path = rig / "static" / "sine_5Hz.log.gz"
     log = emb_daemon.load_log(path)
     estimates = emb_daemon.run(log)
@@ -36,7 +36,7 @@ def test_running_a_log_is_replaying_it(rig):
     assert np.array_equal(log.force_N, replayed.force_N, equal_nan=True)
 
 
-def test_stepping_is_running(rig):
+def test_step_equals_run(rig):
     """The object for control loops, given a log's samples one by one, answers as the whole log does."""
     log = emb_daemon.load_log(rig / "static" / "sine_5Hz.log.gz")
     # The object takes its brake for released from the first call on; the log's first sample has heard no status yet.
@@ -68,7 +68,7 @@ _REST = {"backplates_C": (20.0, 20.0), "wheel_speed_rad_per_s": 0.0, "wheel_puls
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
 @pytest.mark.parametrize("name", ["angle_rad", "speed_rad_per_s", "dt_s", "ambient_C", "vehicle_speed_m_per_s"])
-def test_what_is_no_number_is_refused_by_name_and_changes_nothing(name, value):
+def test_a_value_that_is_not_finite_is_refused_by_name_and_changes_nothing(name, value):
     refused, other = emb_daemon.Estimator(), emb_daemon.Estimator()
     good = {"angle_rad": 1.0, "speed_rad_per_s": 5.0, "current_A": 0.3, **_REST}
     for estimator in (refused, other):
@@ -80,7 +80,7 @@ def test_what_is_no_number_is_refused_by_name_and_changes_nothing(name, value):
 
 
 @pytest.mark.parametrize("dt_s", [0.0, -0.004])
-def test_time_goes_on(dt_s):
+def test_a_time_step_must_be_above_zero(dt_s):
     estimator = emb_daemon.Estimator()
     estimator.step(0.0, 0.0, 0.0, **_REST)
     with pytest.raises(ValueError, match="dt_s"):
@@ -92,7 +92,7 @@ def test_time_goes_on(dt_s):
     ("name", "reason"),
     [("current_A", "current lost"), ("wheel_speed_rad_per_s", "wheel speed lost"), ("wheel_pulse", "wheel pulse lost")],
 )
-def test_an_optional_input_that_is_no_number_is_missing(name, reason, value):
+def test_an_optional_input_that_is_not_finite_counts_as_missing(name, reason, value):
     """And is forgotten: what comes after is as good as ever."""
     estimator = emb_daemon.Estimator()
     estimator.step(0.0, 0.0, 0.0, **_REST)
@@ -102,7 +102,7 @@ def test_an_optional_input_that_is_no_number_is_missing(name, reason, value):
     assert again.reasons == () and again.sigma_N < 500.0
 
 
-def test_backing_plates_that_are_no_numbers_are_missing():
+def test_backing_plates_that_are_not_finite_count_as_missing():
     answer = emb_daemon.Estimator().step(0.0, 0.0, 0.0, **(_REST | {"backplates_C": (20.0, float("nan"))}))
     assert "thermocouple lost" in answer.reasons
 
@@ -165,7 +165,7 @@ def test_example_own_effect(tmp_path):
     assert np.array_equal(change[:120], np.zeros(120)) and plain[-1] > 2000.0 and change[-1] < -20.0
 
 
-def test_an_effect_that_comes_too_late_is_refused():
+def test_an_effect_registered_too_late_is_refused():
     """Once the estimator is compiled without it, it would be believed and do nothing."""
     with pytest.raises(RuntimeError, match="already"):
         extend(REGISTRY[0])

@@ -169,7 +169,7 @@ def test_a_current_that_is_queued_late_still_belongs_to_its_sample(driven):
     assert len(late) == 1 and len(driven.estimates) == before + 1 and np.isfinite(driven.estimates[-1]["torque_force"])
 
 
-def test_what_a_full_batch_leaves_in_the_queue_is_not_missed(driven):
+def test_frames_left_by_a_full_batch_are_not_counted_as_missing(driven):
     """After half a second's stall more is waiting than one look takes: what is still to come was not lost."""
     stalled, smooth = driven, Driven()
     smooth.run(150)
@@ -204,7 +204,7 @@ def test_step_of_the_real_time_clock(monkeypatch):
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_what_the_kernel_says_beside_a_frame_is_read(order):
+def test_control_messages_of_the_kernel_are_read(order):
     """Its stamp and how many frames it dropped, as control messages in either order."""
     near, far = socket_pair()
     time.sleep(0.005)
@@ -238,7 +238,7 @@ def test_a_hold_up_between_reading_two_clocks_moves_no_stamp(monkeypatch):
         assert abs(bus._offset_ns - before) < 2_000_000
 
 
-def test_a_stamp_that_cannot_be_is_held_between_what_was_heard_before_and_now():
+def test_an_impossible_stamp_is_limited_to_between_the_last_frame_and_now():
     near, far = socket_pair()
     for wrong in (-(10**12), 10**12):
         batch = far._received
@@ -287,7 +287,7 @@ def test_a_frame_that_comes_while_the_loop_is_held_up_keeps_its_stamp(monkeypatc
         assert bus.drain()["time_ns"][0] <= sent[0] + _CLOCKS_NS
 
 
-def test_frames_without_room_are_counted_beside_their_stamps():
+def test_dropped_frames_are_counted_from_control_messages():
     """The kernel says with each frame how many were dropped before it."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs:
         ours.bind(("127.0.0.1", 0))
@@ -372,7 +372,7 @@ def test_a_corner_that_cannot_be_estimated_is_no_reason_to_restart_the_others(dr
 
 
 @pytest.mark.parametrize(("corner", "name"), [(1, "FR"), (3, "RR")])
-def test_a_change_is_logged_as_its_corners(driven, caplog, corner, name):
+def test_a_change_is_logged_for_its_corner(driven, caplog, corner, name):
     estimate = driven.daemon.pipeline.estimates[0]
     estimate["corner"], estimate["mode"], estimate["reasons"], estimate["facts"] = corner, r.DEGRADED, r.STUCK, 0
     driven.daemon._estimated = 0
@@ -494,7 +494,7 @@ def test_swapped_messages_of_a_pair_are_one_sample(car):  # noqa: F811
 
 
 @pytest.mark.parametrize(("bits", "flags"), [(0, 0), (0x8000_0000, EXTENDED), (0x4000_0000, REMOTE), (0x2000_0000, ERROR)])
-def test_what_kind_a_frame_is_the_bits_beside_its_id_tell(bits, flags):
+def test_flag_bits_of_the_id_give_the_kind_of_frame(bits, flags):
     """Of linux/can.h."""
     near, far = socket_pair()
     near._received.raw["can_id"][0], near._received.headers["length"][0] = bits | 0x123, 16

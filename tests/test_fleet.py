@@ -99,7 +99,7 @@ def test_the_clamp_force_of_a_rig_is_beside_the_estimates(tmp_path, calibration)
     assert "clamp_force_ref_N" in fleet.column_names and single.select(fleet.column_names).equals(fleet)
 
 
-def test_each_file_once_a_changed_one_instead_of_what_it_was(tmp_path, logs, scheduler, calibration):
+def test_each_file_is_ingested_once_and_a_changed_one_replaces_its_drives(tmp_path, logs, scheduler, calibration):
     source = tmp_path / "logs/car"
     source.mkdir(parents=True)
     log, text = source / "a.log", gzip.decompress((logs / "car0/drive.0.log.gz").read_bytes())
@@ -149,7 +149,7 @@ def test_a_log_that_was_rotated_is_kept(tmp_path, logs, scheduler):
 
 
 @pytest.mark.parametrize("content", [b"", b"\x1f\x8b\x08\x00rubbish", b"no candump\n", b"(1.0) can0 7FF#00\n"])
-def test_a_damaged_file_is_listed_with_its_reason_and_ends_nothing(tmp_path, logs, content):
+def test_a_damaged_file_is_listed_with_its_reason_and_the_work_goes_on(tmp_path, logs, content):
     broken = tmp_path / "car0" / "broken.log.gz"
     broken.parent.mkdir()
     broken.write_bytes(content)
@@ -193,7 +193,7 @@ def test_a_pattern_that_finds_no_unit_is_refused(tmp_path, logs, pattern):
         jobs(tmp_path, log_files([logs]), pattern)
 
 
-def test_names_of_units_may_hold_anything(tmp_path, logs, calibration):
+def test_names_of_units_may_contain_any_character(tmp_path, logs, calibration):
     [path, _] = log_files([logs / "car0"])
     ingest(tmp_path, Job(path, "VIN 1/2 = ä", "2026-01-01"))
     [drive] = dataset.drives(tmp_path)
@@ -278,7 +278,7 @@ def test_a_worker_that_distributed_cannot_close_ends_no_work(monkeypatch, fault)
         closes(RuntimeError)
 
 
-def test_work_without_workers_ends_and_says_so(monkeypatch):
+def test_without_workers_the_work_ends_with_a_message(monkeypatch):
     """All may die and none come back, on a cluster of others or on a machine that is too busy."""
     from distributed import Client, LocalCluster
 
@@ -288,7 +288,7 @@ def test_work_without_workers_ends_and_says_so(monkeypatch):
         run(client, abs, [1])
 
 
-def test_work_whose_scheduler_is_gone_ends_and_says_so():
+def test_without_its_scheduler_the_work_ends_with_a_message():
     from distributed import Client, LocalCluster
 
     local = LocalCluster(n_workers=0, processes=False, dashboard_address=None)
@@ -299,7 +299,7 @@ def test_work_whose_scheduler_is_gone_ends_and_says_so():
     closing.join()
 
 
-def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, logs, scheduler, calibration):
+def test_a_killed_client_is_resumed_to_the_same_bytes(tmp_path, logs, scheduler, calibration):
     for name in ("at_once", "resumed"):
         _ingested(tmp_path / name, logs)
     drives = dataset.drives(tmp_path / "at_once")
@@ -314,7 +314,7 @@ def test_what_a_killed_client_left_is_gone_on_with_to_the_same_bytes(tmp_path, l
     assert _content(tmp_path / "resumed") == _content(tmp_path / "at_once")
 
 
-def test_what_another_estimator_made_is_made_anew(tmp_path, logs, calibration, monkeypatch):
+def test_results_of_another_estimator_are_computed_anew(tmp_path, logs, calibration, monkeypatch):
     """Otherwise an update would look like a change of the fleet on its day."""
     _ingested(tmp_path, logs)
     unit = next(iter(dataset.by_unit(dataset.drives(tmp_path)).values()))
@@ -337,96 +337,96 @@ def test_what_another_estimator_made_is_made_anew(tmp_path, logs, calibration, m
 
 
 def _fleet(rng):
-    """Units of three batches with scatter that is large in some directions, and prints of causes."""
+    """Units of three batches with scatter that is large in some directions, and signatures of causes."""
     units, size, causes = 60, 6, 12
     spread = np.diag(10.0 ** rng.uniform(-1.0, 0.5, size))
     turn = np.linalg.qr(rng.standard_normal((size, size)))[0]
     values = rng.standard_normal((units, size)) @ spread @ turn
-    prints = rng.standard_normal((causes, size))
+    signatures = rng.standard_normal((causes, size))
     batch = np.arange(units) % 3
-    return values, prints, {f"batch {n}": batch == n for n in range(3)}, {"batch": batch}
+    return values, signatures, {f"batch {n}": batch == n for n in range(3)}, {"batch": batch}
 
 
-def _read(values, prints, factors, noise=0.1, freedom=1000):
-    centre = population.centres(values, factors)
+def _read(values, signatures, factors, noise=0.1, freedom=1000):
+    centre = population.find_centres(values, factors)
     covariance = np.broadcast_to(noise**2 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
-    return centre, population.Readings(values, centre, prints, covariance, np.full(len(values), freedom))
+    return centre, population.Readings(values, centre, signatures, covariance, np.full(len(values), freedom))
 
 
-def test_what_a_batch_shares_is_found_with_its_cause_and_size():
+def test_the_shared_cause_of_a_batch_is_found_with_its_size():
     for seed in range(5):
-        values, prints, groups, factors = _fleet(np.random.default_rng(seed))
-        values[groups["batch 1"]] += 3.0 * prints[4]
-        values[groups["batch 2"]] -= 2.0 * prints[7]
-        found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
+        values, signatures, groups, factors = _fleet(np.random.default_rng(seed))
+        values[groups["batch 1"]] += 3.0 * signatures[4]
+        values[groups["batch 2"]] -= 2.0 * signatures[7]
+        found = population.find_shared_causes(values, groups, _read(values, signatures, factors)[1], against_others=True)
         assert {(one.where, one.cause) for one in found} == {("batch 1", 4), ("batch 2", 7)}
         for one in found:
             truth = 3.0 if one.cause == 4 else -2.0
             assert abs(one.amount - truth) < 5.0 * one.sigma
 
 
-def test_what_a_wrong_shape_leaves_is_no_second_cause():
+def test_the_misfit_of_a_wrong_shape_is_no_second_cause():
     """An effect whose shape lies between those that are tested leaves a rest that many units prove; another cause as large is
     named."""
     for seed in range(5):
         for second, named in ((0.2, {4}), (1.0, {4, 9})):
-            values, prints, groups, factors = _fleet(np.random.default_rng(seed))
-            covariance = np.linalg.inv(_read(values, prints, factors)[1].inverse)
+            values, signatures, groups, factors = _fleet(np.random.default_rng(seed))
+            covariance = np.linalg.inv(_read(values, signatures, factors)[1].inverse)
             # As far from each other, and from others, as causes can be.
-            prints[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
-            values[groups["batch 1"]] += prints[4] + second * prints[9]
-            found = population.shared_causes(values, groups, _read(values, prints, factors)[1], beside=True)
+            signatures[[4, 9]] = 30.0 * np.linalg.cholesky(covariance).T[[0, 1]]
+            values[groups["batch 1"]] += signatures[4] + second * signatures[9]
+            found = population.find_shared_causes(values, groups, _read(values, signatures, factors)[1], against_others=True)
             assert {one.cause for one in found} == named and {one.where for one in found} == {"batch 1"}, (seed, second)
 
 
-def test_where_nothing_is_shared_nobody_is_accused():
+def test_a_healthy_fleet_has_no_findings():
     """60 fleets of healthy units: of all accusations one in a hundred fleets may be false, and of units one in a hundred."""
     batches = units = 0
     for seed in range(60):
-        values, prints, groups, factors = _fleet(np.random.default_rng(1000 + seed))
-        centre, readings = _read(values, prints, factors)
-        batches += bool(population.shared_causes(values, groups, readings, beside=True))
-        units += bool(population.outliers(values - centre, readings))
+        values, signatures, groups, factors = _fleet(np.random.default_rng(1000 + seed))
+        centre, readings = _read(values, signatures, factors)
+        batches += bool(population.find_shared_causes(values, groups, readings, against_others=True))
+        units += bool(population.find_outliers(values - centre, readings))
     # Binomial, 0.1 %.
     assert batches <= 5 and units <= 5
 
 
-def test_a_unit_unlike_the_others_is_named_and_does_not_hide_a_second_one():
-    values, prints, _, factors = _fleet(np.random.default_rng(3))
-    values[10] += 12.0 * prints[2]
-    values[20] -= 12.0 * prints[5]
-    centre, readings = _read(values, prints, factors)
-    found = population.outliers(values - centre, readings)
+def test_two_outlying_units_are_both_found():
+    values, signatures, _, factors = _fleet(np.random.default_rng(3))
+    values[10] += 12.0 * signatures[2]
+    values[20] -= 12.0 * signatures[5]
+    centre, readings = _read(values, signatures, factors)
+    found = population.find_outliers(values - centre, readings)
     assert {(one.where, one.cause): one.amount for one in found} == pytest.approx({(10, 2): 12.0, (20, 5): -12.0}, rel=0.2)
     # Were its own drives as far apart, it would be none.
-    centre, readings = _read(values, prints, factors, noise=20.0)
-    assert population.outliers(values - centre, readings) == []
+    centre, readings = _read(values, signatures, factors, noise=20.0)
+    assert population.find_outliers(values - centre, readings) == []
 
 
-def test_a_unit_whose_few_drives_happen_to_agree_is_not_accused():
+def test_noise_estimated_from_few_drives_makes_no_outliers():
     """Healthy units that differ by their noise alone, each of which knows it from four drives: twenty of those whose drives
     scatter most lie far out, and as many of all seem sure of it. Known from a thousand drives, the same is an accusation."""
     rng, accused = np.random.default_rng(0), {3: 0, 1000: 0}
     for _ in range(20):
-        _, prints, _, factors = _fleet(rng)
+        _, signatures, _, factors = _fleet(rng)
         true = np.where(np.arange(60) % 3 == 0, 4.0, 1.0)
         values = true[:, None] * rng.standard_normal((60, 6))
         told = true**2 * rng.chisquare(3, 60) / 3.0
-        centre = population.centres(values, factors)
+        centre = population.find_centres(values, factors)
         noise = told[:, None, None] * np.eye(6)
         for freedom in accused:
-            readings = population.Readings(values, centre, prints, noise, np.full(60, freedom))
-            accused[freedom] += bool(population.outliers(values - centre, readings))
+            readings = population.Readings(values, centre, signatures, noise, np.full(60, freedom))
+            accused[freedom] += bool(population.find_outliers(values - centre, readings))
     assert accused[3] <= 1 and accused[1000] > 5, accused
 
 
-def test_what_a_workshop_could_not_confirm_is_not_reported(monkeypatch):
+def test_differences_too_small_to_confirm_are_not_reported(monkeypatch):
     """However sure it is: of a unit less than 36 N, of a batch, whose mean many units tell, less than 10 N."""
     own = object.__new__(findings._Study)
     own.keys, own.masks = [("a", "FL"), ("b", "FL")], {"batch A": np.ones(2, bool)}
     own.causes, own.directions = [SimpleNamespace(name="", key="", shape="", unit="")], SimpleNamespace(size_N=np.ones(1))
     found = [population.Difference(row, 0, size_N, 1.0, 1e-9, ()) for row, size_N in enumerate((-35.0, -37.0))]
-    monkeypatch.setattr(findings, "outliers", lambda *_: found)
+    monkeypatch.setattr(findings, "find_outliers", lambda *_: found)
     assert [one.where for one in own._outliers(np.zeros(0), None, lambda _: "")] == ["b FL"]
     shared = [population.Difference("batch A", 0, size_N, 1.0, 1e-9, ()) for size_N in (9.0, -11.0)]
     assert [one.size_N for one in own._list_shared(shared, lambda _: "")] == [-11.0]
@@ -436,13 +436,13 @@ def test_random_effects_take_each_units_own_noise_out():
     rng = np.random.default_rng(0)
     sigmas = rng.uniform(0.5, 3.0, 4000)
     truth = rng.normal(10.0, 1.5, len(sigmas))
-    found = population.random_effects(truth + sigmas * rng.standard_normal(len(sigmas)), sigmas)
+    found = population.estimate_random_effects(truth + sigmas * rng.standard_normal(len(sigmas)), sigmas)
     assert found.mean == pytest.approx(10.0, abs=5.0 * found.sigma)
     assert found.spread == pytest.approx(1.5, rel=0.1)
 
 
 def test_units_that_differ_by_their_noise_alone_have_no_spread():
-    found = population.random_effects(np.array([1.0, 1.1, 0.9]), np.full(3, 1.0))
+    found = population.estimate_random_effects(np.array([1.0, 1.1, 0.9]), np.full(3, 1.0))
     assert found.spread == 0.0
 
 
@@ -459,7 +459,7 @@ def _scores(rng, unit, amounts, count, warmth=None):
     return result
 
 
-def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
+def test_the_stated_noise_of_a_unit_is_its_scatter():
     """However few drives it has; and its size is not drawn to zero."""
     rng, truth = np.random.default_rng(0), np.array([1.0, -2.0, 0.0, 0.5])
     flat = population.Directions(np.eye(4) / 50.0, np.eye(4) * 50.0, np.full(4, 50.0))
@@ -467,22 +467,22 @@ def test_what_a_unit_is_said_to_scatter_by_is_what_it_scatters_by():
     for _ in range(400):
         from_drive_to_drive = 0.3 * rng.standard_normal((4, 4))
         drives = _scores(rng, "u", lambda number, own=from_drive_to_drive: truth + own[number], 4)
-        units.append(population.unit_of(drives, flat, np.ones((4, 1)), [np.eye(4)]))
+        units.append(population.fit_unit(drives, flat, np.ones((4, 1)), [np.eye(4)]))
     values, noise = np.array([unit.values[0] for unit in units]), np.array([np.diag(unit.noise[0]) for unit in units])
     np.testing.assert_allclose(values.mean(axis=0) / 50.0, truth, atol=0.03)
     np.testing.assert_allclose(noise.mean(axis=0), values.var(axis=0), rtol=0.15)
 
 
-def test_who_asks_twice_as_many_questions_is_half_as_sure():
+def test_p_values_are_corrected_for_the_number_of_tests():
     """The same causes listed twice tell nothing new of anybody: each is its twin's rival."""
-    values, prints, groups, factors = _fleet(np.random.default_rng(3))
-    values[10] += 12.0 * prints[2]
-    values[groups["batch 1"]] += 3.0 * prints[4]
-    chances, count = [], len(prints)
-    for causes, rivals in ((prints, ((), ())), (np.concatenate([prints, prints]), ((2 + count,), (4 + count,)))):
+    values, signatures, groups, factors = _fleet(np.random.default_rng(3))
+    values[10] += 12.0 * signatures[2]
+    values[groups["batch 1"]] += 3.0 * signatures[4]
+    chances, count = [], len(signatures)
+    for causes, rivals in ((signatures, ((), ())), (np.concatenate([signatures, signatures]), ((2 + count,), (4 + count,)))):
         centre, readings = _read(values, causes, factors)
-        [unit] = [one for one in population.outliers(values - centre, readings) if one.where == 10]
-        batch = population.shared_causes(values, groups, readings, beside=True)[0]
+        [unit] = [one for one in population.find_outliers(values - centre, readings) if one.where == 10]
+        batch = population.find_shared_causes(values, groups, readings, against_others=True)[0]
         chances.append((unit.chance, batch.chance))
         assert (unit.rivals, batch.rivals) == rivals
     np.testing.assert_allclose(chances[1], 2.0 * np.array(chances[0]), rtol=1e-6)
@@ -491,11 +491,11 @@ def test_who_asks_twice_as_many_questions_is_half_as_sure():
 
 def test_a_unit_is_measured_by_the_scatter_of_others():
     """By its own, it would excuse itself."""
-    values, prints, _, factors = _fleet(np.random.default_rng(4))
-    centre, readings = _read(values, prints, factors)
-    values[7] += 3.0 * prints[1]
+    values, signatures, _, factors = _fleet(np.random.default_rng(4))
+    centre, readings = _read(values, signatures, factors)
+    values[7] += 3.0 * signatures[1]
     noise = np.broadcast_to(0.01 * np.eye(values.shape[1]), (len(values), *2 * values.shape[1:]))
-    again = population.Readings(values, centre, prints, noise, np.full(len(values), 1000))
+    again = population.Readings(values, centre, signatures, noise, np.full(len(values), 1000))
     np.testing.assert_allclose(again.filters[7], readings.filters[7], rtol=1e-9)
     assert np.abs(again.filters[8] / readings.filters[8] - 1.0).max() > 1e-3
 
@@ -513,7 +513,7 @@ def test_few_healthy_units_are_ordinary():
     assert odd <= 8, odd
 
 
-def test_a_small_batch_that_scatters_more_is_not_accused_for_that():
+def test_a_small_batch_with_more_scatter_is_no_finding():
     rng = np.random.default_rng(0)
     chances = [population._compare(3.0 * rng.standard_normal(5), rng.standard_normal(55))[0] for _ in range(600)]
     # Binomial, 0.1 %; were both thought to scatter alike, it would be a third.
@@ -521,7 +521,7 @@ def test_a_small_batch_that_scatters_more_is_not_accused_for_that():
 
 
 @pytest.mark.parametrize(("per_30_days", "per_10_K"), [(1.5, 0.0), (0.0, 0.8), (-1.0, -1.0), (0.0, 0.0)])
-def test_drift_and_season_are_told_apart_with_their_sizes(per_30_days, per_10_K):
+def test_drift_and_season_are_distinguished_with_their_sizes(per_30_days, per_10_K):
     """Of the first cause, in each unit somewhat differently; days and warmth are not the same."""
     rng = np.random.default_rng(1)
     fleet = {}
@@ -567,7 +567,7 @@ def test_a_misfit_is_no_season_where_a_cause_acts_by_temperature(seed):
     assert season.cause == "c" and season.amount == pytest.approx(0.2, rel=0.15)
 
 
-def test_a_cause_that_acts_by_temperature_has_no_season_but_in_a_batch():
+def test_a_thermal_cause_has_a_season_only_in_a_batch():
     """The curvature of its own law; what it explains is nobody else's season either. It drifts like any other."""
     rng, fleet, factors = np.random.default_rng(5), {}, {}
     for number in range(16):
@@ -590,7 +590,7 @@ def test_a_cause_that_acts_by_temperature_has_no_season_but_in_a_batch():
         assert ("all units", cause) in {(o.where, o.cause) for o in findings.find(fleet, plain, "", factors, {}).seasons}
 
 
-def test_what_cannot_be_told_from_a_cause_that_acts_by_temperature_is_no_season():
+def test_a_season_that_a_thermal_misfit_explains_as_well_is_no_finding():
     """The first cause makes nearly the second one's force, so a misfit of the model's heat may look like either."""
     rng, fleet = np.random.default_rng(8), {}
     for number in range(16):
@@ -629,14 +629,14 @@ def test_a_slope_is_of_what_changes_within_units_wherever_they_are():
     drives = [_scores(rng, f"unit-{number}", lambda drive: np.zeros(4), 12) for number in range(6)]
     flat = population.Directions(np.eye(4) / np.sqrt(200.0) / 50.0, np.eye(4), np.ones(4))
     warmth = [place + 0.3 * rng.standard_normal(12) for place in (-2.0, -2.0, 0.0, 0.0, 2.0, 2.0)]
-    assert population.changing(drives, flat, warmth).shape == (4, 4)
+    assert population.find_slope_directions(drives, flat, warmth).shape == (4, 4)
 
 
 def test_a_cause_that_is_mostly_a_level_of_others_has_no_slope():
-    prints = np.array([[1.0, 0.0], [1.0, 1.0], [0.1, 1.0]])
-    directions = population.Directions(np.eye(2), prints, np.ones(3))
-    np.testing.assert_array_equal(directions.prints_in(np.array([[1.0], [0.0]])), [[1.0], [1.0], [0.0]])
-    np.testing.assert_array_equal(directions.prints_in(np.eye(2)), prints)
+    signatures = np.array([[1.0, 0.0], [1.0, 1.0], [0.1, 1.0]])
+    directions = population.Directions(np.eye(2), signatures, np.ones(3))
+    np.testing.assert_array_equal(directions.signatures_in(np.array([[1.0], [0.0]])), [[1.0], [1.0], [0.0]])
+    np.testing.assert_array_equal(directions.signatures_in(np.eye(2)), signatures)
 
 
 # -- end to end -------------------------------------------------------------------------------------------------------
@@ -685,7 +685,7 @@ def fleet(tmp_path_factory, calibration):
     return root, found
 
 
-def test_what_a_batch_shares_is_named_without_a_force_sensor(fleet):
+def test_the_shared_cause_of_a_batch_is_found_without_a_force_sensor(fleet):
     _, found = fleet
     [one] = found.groups
     # Of the two halves either may be called the one that is apart.
@@ -703,7 +703,7 @@ def test_front_and_rear_differ_by_design(fleet, calibration):
     assert fleet[1].groups and not found.groups and not found.outliers
 
 
-def test_the_report_is_one_file_that_says_what_was_found(fleet, tmp_path):
+def test_the_report_is_one_file_with_the_findings(fleet, tmp_path):
     root, found = fleet
     assert main(["fleet", "report", str(root), "--output", str(tmp_path / "fleet.html")]) == 0
     page = (tmp_path / "fleet.html").read_text()
@@ -711,7 +711,7 @@ def test_the_report_is_one_file_that_says_what_was_found(fleet, tmp_path):
     assert findings.load(root) == found
 
 
-def test_scores_are_kept_and_only_new_drives_are_asked(fleet, calibration, monkeypatch):
+def test_stored_scores_are_kept_and_only_new_drives_are_scored(fleet, calibration, monkeypatch):
     root, _ = fleet
     drives = next(iter(dataset.by_unit(dataset.drives(root)).values()))
     path = scores.scores_path(root, drives[0].unit, drives[0].corner)
@@ -728,7 +728,7 @@ def test_scores_are_kept_and_only_new_drives_are_asked(fleet, calibration, monke
     assert not scores.score_unit(root, drives, calibration), "why a drive that is gone said nothing"
 
 
-def test_a_drive_that_says_nothing_says_why(fleet, calibration):
+def test_an_unusable_drive_is_listed_with_its_reason(fleet, calibration):
     root, _ = fleet
     drive = dataset.drives(root)[0]
     log, _ = dataset.read_drive(root, drive)
@@ -737,7 +737,7 @@ def test_a_drive_that_says_nothing_says_why(fleet, calibration):
         scores.Scorer(calibration).score(still, drive)
 
 
-def test_a_drive_is_not_cut_into_episodes_that_nobody_asks_for(fleet, calibration, monkeypatch):
+def test_a_drive_is_scored_without_cutting_it_into_episodes(fleet, calibration, monkeypatch):
     """The whole step would be run once more."""
     drive = dataset.drives(fleet[0])[0]
     monkeypatch.setattr(residuals, "make_trial", lambda *_: pytest.fail("it was cut"))
@@ -794,12 +794,12 @@ def test_without_trainings_there_is_no_prior(tmp_path, calibration):
 
 
 @pytest.mark.parametrize("text", ["", "unit\na\n", "car,batch\na,b\n", "unit,batch\na,b\na,c\n", "unit,batch\na\n"])
-def test_a_table_of_units_that_is_none_is_refused(tmp_path, text):
+def test_a_malformed_table_of_units_is_refused(tmp_path, text):
     (tmp_path / "units.csv").write_text(text)
     with pytest.raises(InputError, match=r"units\.csv"):
         findings.read_units(tmp_path / "units.csv")
 
 
-def test_a_table_of_units_that_is_not_there_is_named_once(tmp_path):
+def test_a_missing_table_of_units_is_named_once(tmp_path):
     with pytest.raises(InputError, match=r"^\S*/units\.csv: No such file or directory$"):
         findings.read_units(tmp_path / "units.csv")

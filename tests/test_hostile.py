@@ -113,7 +113,7 @@ def test_what_was_learned_from_two_senders_is_forgotten(learns, tmp_path):
     assert np.all(after["sigma"] < 300.0), "it is of use again at once"
 
 
-def test_nothing_is_kept_of_a_brake_with_two_senders():
+def test_no_snapshot_is_taken_of_a_brake_with_two_senders():
     calibration = shipped_calibration()
     state, snapshot = new_state()[0], np.zeros(1, restart.SNAPSHOT)[0]
     state["started"] = True

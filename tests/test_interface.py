@@ -93,7 +93,7 @@ def _rows(*command, samples: np.ndarray) -> np.ndarray:
 
 
 @needs_cc
-def test_in_c_every_byte_is_replays(exported, compiled, drive):
+def test_in_c_every_byte_equals_replay(exported, compiled, drive):
     (exported / "rows.c").write_text(_ROWS)
     program = _built(exported, exported / "rows.c", compiled / "kernels.so")
     found = _rows(program, samples=drive.samples)
@@ -115,7 +115,7 @@ def test_on_aarch64_the_numbers_are_the_same(exported, compiled, drive):
 
 
 @needs_cc
-def test_the_example_in_c_says_what_python_says(exported, compiled, drive):
+def test_the_example_in_c_prints_what_python_prints(exported, compiled, drive):
     program = _built(exported, adaptkit.ROOT / "examples" / "estimate.c", compiled / "kernels.so")
     samples = drive.samples[:3000].copy()
     for signal in signals.INPUTS:
@@ -144,7 +144,7 @@ def test_a_header_of_other_sources_does_not_link(exported, compiled, tmp_path):
         _built(tmp_path, tmp_path / "rows.c", compiled / "kernels.so")
 
 
-def test_every_field_that_is_read_or_told_is_described():
+def test_every_input_field_is_described():
     named = {signal.field.partition("[")[0] for signal in signals.INPUTS} | set(signals.BOOKKEEPING)
     assert set(SAMPLE.names) == named
     for signal in signals.INPUTS:
@@ -272,7 +272,7 @@ def test_the_fmu_is_valid(exported, fmpy):
     assert validate_fmu(str(exported / "brake.fmu")) == []
 
 
-def test_in_the_fmu_every_number_is_replays(fmu, drive):
+def test_in_the_fmu_every_number_equals_replay(fmu, drive):
     _begin(fmu[0])
     found = _stepped(*fmu, drive.samples[:2500])
     for signal in signals.OUTPUTS:
@@ -313,7 +313,7 @@ def test_a_parameter_of_the_fmu_is_a_number_of_the_calibration(fmu, drive):
         instance.setFloat64([reference["motor.torque_constant_Nm_per_A"]], [0.05])
 
 
-def test_a_simulation_goes_back_to_a_state_that_was_kept(fmu, drive):
+def test_a_simulation_returns_to_a_saved_state(fmu, drive):
     instance, reference = fmu
     _begin(instance)
     samples = drive.samples[:400]
@@ -332,7 +332,7 @@ def test_a_simulation_goes_back_to_a_state_that_was_kept(fmu, drive):
         instance.freeFMUState(each)
 
 
-def test_what_the_fmu_cannot_do_it_says(fmu):
+def test_the_fmu_reports_what_it_does_not_support(fmu):
     instance, reference = fmu
     _begin(instance)
     with pytest.raises(Exception, match="fmi3DoStep"):
@@ -374,7 +374,7 @@ def test_the_example_closes_a_loop_around_the_fmu(exported, fmpy):
     assert abs(own_N - 8000.0) < 100.0
 
 
-def test_without_a_library_it_says_what_makes_one(tmp_path, capsys):
+def test_without_a_library_the_message_names_the_command_that_makes_one(tmp_path, capsys):
     arguments = ["export", "--calibration", str(_CALIBRATION), "--output", str(tmp_path / "brake.fmu")]
     assert main([*arguments, "--kernels", str(tmp_path / "none.so")]) == 2
     expected = f"{tmp_path}/none.so: No such file or directory; emb-daemon compile --output {tmp_path}/none.so makes it\n"

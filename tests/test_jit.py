@@ -66,14 +66,14 @@ def _quarter(value):
     return _half(_half(value))
 
 
-def test_what_only_kernels_call_is_not_made_callable_from_python():
+def test_functions_that_only_kernels_call_have_no_python_wrapper():
     """A fifth of a cold start would be spent on it."""
     assert _quarter(4.0) == 1.0
     assert _quarter.signatures == [(types.float64,)] and not _half.signatures
     assert _half(4.0) == 2.0
 
 
-def test_what_only_kernels_call_is_translated_with_them_alone():
+def test_functions_that_only_kernels_call_are_translated_with_them():
     """And not before, with all that it calls in turn, as numba would: a fifth of a cold start."""
     assert _quarter(4.0) == 1.0
     # A kernel that an earlier run has kept does not even need its parts.
@@ -96,7 +96,7 @@ print(far(3.0, 4.0), _compilations.count)
 
 
 @pytest.mark.trial
-def test_another_kernel_takes_from_the_cache_what_it_calls(tmp_path):
+def test_another_kernel_loads_its_callees_from_the_cache(tmp_path):
     """The kernel with `hypot` and `sq`; then, changed, the kernel alone; then nothing."""
     for factor, said in ((1.0, "5.0 3"), (2.0, "10.0 1"), (None, "10.0 0")):
         if factor:
@@ -106,7 +106,7 @@ def test_another_kernel_takes_from_the_cache_what_it_calls(tmp_path):
 
 
 @pytest.mark.trial
-def test_what_kernels_call_is_not_loaded_for_a_call_from_python(tmp_path):
+def test_code_for_kernels_is_not_loaded_for_a_call_from_python(tmp_path):
     """`hypot` calls `sq`, which is kept as kernels call it; then both are kept as Python calls them."""
     code = "from emb_daemon.jit import compiled_for_the_next_start, hypot, sq; print({}, compiled_for_the_next_start())"
     for call, result in (
@@ -147,7 +147,7 @@ def kept(tmp_path_factory) -> Path:
     return folder
 
 
-def test_compiled_code_goes_where_it_is_told(kept):
+def test_compiled_code_goes_into_the_chosen_folder(kept):
     assert list(kept.rglob("*.nbi")), "nothing was kept"
 
 
@@ -163,7 +163,7 @@ def test_a_folder_that_anybody_can_write_to_is_not_loaded_from(tmp_path, kept, b
     assert Path(done.stdout.strip()) != folder
 
 
-def test_an_unwritable_folder_is_told_of_once_and_does_without(tmp_path):
+def test_an_unwritable_folder_is_reported_once_and_not_used(tmp_path):
     (tmp_path / "file").write_text("a file where the folder should be")
     done = processkit.python("-c", _CALL, NUMBA_CACHE_DIR=str(tmp_path / "file"))
     assert done.returncode == 0, done.stderr

@@ -14,7 +14,7 @@ def _store(number: int) -> Store:
     return adaptkit.accepted(empty)
 
 
-def test_of_what_was_kept_nothing_older_may_be_found(tmp_path):
+def test_the_study_of_kills_accepts_no_older_state(tmp_path):
     """Between what a life says before a write and after it, the old file or the new one; after it the new one alone."""
     hears, says = os.pipe()
     memory, stores = study.TellingMemory(tmp_path, says), [_store(number) for number in range(3)]
@@ -33,7 +33,7 @@ def test_of_what_was_kept_nothing_older_may_be_found(tmp_path):
         os.close(end)
 
 
-def test_what_is_known_when_a_training_is_accepted_survives_a_kill_then(tmp_path, monkeypatch):
+def test_the_state_at_an_accepted_training_survives_a_kill(tmp_path, monkeypatch):
     """Not ten seconds later: the snapshots before it belong to values that are no longer in use."""
     monkeypatch.setattr(Adaptation, "close", lambda *_: None)
     study.live(Memory(tmp_path), adaptkit.shipped(), 7.0)
@@ -41,7 +41,7 @@ def test_what_is_known_when_a_training_is_accepted_survives_a_kill_then(tmp_path
     assert after.current("FL") is not None and list(after._resumable) == [0]
 
 
-def test_a_training_daemon_that_is_killed_leaves_what_was_accepted(tmp_path):
+def test_a_kill_during_training_keeps_accepted_values(tmp_path):
     result = study.kills(2, 1, tmp_path, adaptkit.shipped(), load=0)
     assert result["kills"] == 2
     assert not any(result[name] for name in ("torn", "lost", "foreign", "snapshots"))

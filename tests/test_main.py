@@ -38,7 +38,7 @@ def test_an_error_is_one_line_and_a_status(monkeypatch, capsys, error, status, l
     assert capsys.readouterr().err.splitlines() == ([line] if line else [])
 
 
-def test_a_module_of_our_own_that_is_missing_is_a_defect(monkeypatch):
+def test_a_missing_module_of_the_package_is_a_defect(monkeypatch):
     def fail(arguments):
         raise ModuleNotFoundError("x", name="emb_daemon.nothing")
 
@@ -55,14 +55,14 @@ def test_a_module_of_our_own_that_is_missing_is_a_defect(monkeypatch):
         (["demo"], "matplotlib"),
     ],
 )
-def test_a_command_of_the_bench_says_what_the_box_lacks_before_it_works(monkeypatch, capsys, arguments, library):
+def test_a_command_names_missing_libraries_before_it_works(monkeypatch, capsys, arguments, library):
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == library else found(name, *rest))
     assert main(arguments) == 2
     assert capsys.readouterr().err == f"emb-daemon {arguments[0]} needs {library}: pip install 'emb_daemon[offline]'\n"
 
 
-def test_a_reader_that_has_gone_is_no_error(monkeypatch):
+def test_a_closed_pipe_is_no_error(monkeypatch):
     def fail(arguments):
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
@@ -71,7 +71,7 @@ def test_a_reader_that_has_gone_is_no_error(monkeypatch):
     assert main(["check", "--config", "emb.yaml"]) == 0
 
 
-def test_a_terminal_without_our_characters_is_no_reason_to_end():
+def test_a_terminal_without_our_characters_ends_no_command():
     code = "from emb_daemon.cli import check, main; check.run = lambda _: print('3 ± 1 kN') or 0; "
     code += "raise SystemExit(main.main(['check', '--config', 'x']))"
     done = processkit.python("-c", code, PYTHONIOENCODING="ascii:strict")
@@ -79,7 +79,7 @@ def test_a_terminal_without_our_characters_is_no_reason_to_end():
 
 
 @pytest.mark.parametrize("seconds", ["0", "-1", "nan"])
-def test_a_bench_of_no_time_is_wrong_usage(capsys, seconds):
+def test_a_bench_without_time_is_wrong_usage(capsys, seconds):
     assert main(["bench", "--seconds", seconds]) == 2
     assert "expected at least 2" in capsys.readouterr().err
 
@@ -100,7 +100,7 @@ def test_a_bench_of_no_time_is_wrong_usage(capsys, seconds):
          "{tmp}/a.log: cannot be a folder of the data set: File exists"),
     ],
 )  # fmt: skip
-def test_a_number_or_a_folder_that_cannot_be_is_refused_in_one_line(tmp_path, capsys, arguments, line):
+def test_an_impossible_number_or_folder_is_refused_in_one_line(tmp_path, capsys, arguments, line):
     (tmp_path / "a.log").touch()
     names = {"tmp": tmp_path, "config": resource("config/emb.yaml")}
     assert main(arguments.format(**names).split()) == 2

@@ -32,9 +32,9 @@ def _force(cycle: int, force_kN: float = 5.0, status: int = 0, corner: str = "FL
     )  # fmt: skip
 
 
-def _hear(*frames) -> Listener:
+def _receive(*frames) -> Listener:
     listener = Listener()
-    listener.hear(np.concatenate(frames))
+    listener.receive(np.concatenate(frames))
     return listener
 
 
@@ -54,7 +54,7 @@ def test_the_broadcasts_of_all_corners_are_listened_to():
 
 
 def test_every_signal_reaches_the_state():
-    listener = _hear(
+    listener = _receive(
         _force(0),
         wirekit.frame("EMB_FL_PadTemp", 100 * S, InnerSurfaceTemp=301.25, InnerMeanTemp=-12.5, OuterSurfaceTemp=290.0,
                       OuterMeanTemp=150.0),
@@ -84,7 +84,7 @@ def test_every_signal_reaches_the_state():
 
 @pytest.mark.parametrize("status", [2, 15])
 def test_a_value_that_is_not_to_be_used_is_not_shown(status):
-    listener = _hear(_force(0, 7.77, status))
+    listener = _receive(_force(0, 7.77, status))
     assert listener.corners[0].state(100 * S)["clamp_force_kN"] is None
     assert "7.77" not in "\n".join(_text(listener))
     assert all(math.isnan(value) for value in listener.corners[0].forces_kN(102 * S))
@@ -92,7 +92,7 @@ def test_a_value_that_is_not_to_be_used_is_not_shown(status):
 
 @pytest.mark.parametrize("lost", [1, 7, 14, 15, 20, 100])
 def test_lost_frames_are_counted_across_turns_of_the_counter(lost):
-    corner = _hear(*[_force(c) for c in range(20)], *[_force(c) for c in range(20 + lost, 40 + lost)]).corners[0]
+    corner = _receive(*[_force(c) for c in range(20)], *[_force(c) for c in range(20 + lost, 40 + lost)]).corners[0]
     assert (corner.missing, corner.damaged) == (lost, 0)
 
 
@@ -105,14 +105,14 @@ def test_a_sender_that_stands_still_has_lost_no_frames(stalled, catches_up):
         back = 20 + stalled
         late = max(back - cycle, 0) if catches_up else stalled
         frame["time_ns"] += np.int64(late * 4_000_000)
-    corner = _hear(*frames).corners[0]
+    corner = _receive(*frames).corners[0]
     assert (corner.missing, corner.damaged, corner.streams[0].received) == (0, 0, 60)
 
 
 def test_a_damaged_or_repeated_frame_changes_nothing():
     bad = _force(1, 9.0)
     bad["data"] ^= np.uint64(1 << 20)
-    corner = _hear(_force(0), bad, _force(0, 9.0, counter=0)).corners[0]
+    corner = _receive(_force(0), bad, _force(0, 9.0, counter=0)).corners[0]
     assert (corner.state(100 * S)["clamp_force_kN"], corner.damaged, corner.missing) == (5.0, 2, 0)
 
 
@@ -121,7 +121,7 @@ def test_the_last_minute_keeps_its_peaks():
     listener = Listener()
     for second in range(70):
         for cycle in range(3):
-            listener.hear(
+            listener.receive(
                 _force(250 * second + cycle, 18.0 if (second, cycle) == (39, 1) else 4.0, counter=(3 * second + cycle) % 15)
             )
     history = listener.corners[0].forces_kN(170 * S)
@@ -130,8 +130,8 @@ def test_the_last_minute_keeps_its_peaks():
     assert len(line) == 20 and line.count("█") == 1
 
 
-def test_silence_is_said():
-    shown = "\n".join(_text(_hear(_force(0)), now_ns=107 * S))
+def test_silence_is_shown():
+    shown = "\n".join(_text(_receive(_force(0)), now_ns=107 * S))
     assert "SILENT for 7 s" in shown
 
 
@@ -143,7 +143,7 @@ def test_four_corners_at_their_worst_fit_the_screen(size):
         frames += [
             wirekit.frame(f"EMB_{corner}_EstimatorStatus", 100 * S, Mode=3, ContactAngle=-3276.8, DegradedReasons=0xFFFF)
         ]
-    lines = _text(_hear(*frames), width=size[0], height=size[1])
+    lines = _text(_receive(*frames), width=size[0], height=size[1])
     assert len(lines) <= size[1] and max(map(len, lines)) <= size[0]
     assert "q quit" in lines[-1] and "space pause" in lines[-1] and "r reset" in lines[-1]
     if size[1] >= 24:
@@ -173,7 +173,7 @@ def test_a_script_gets_json_from_a_bus(capsys):
     assert list(corners) == ["FL"] and corners["FL"]["clamp_force_kN"] == 5.0 and corners["FL"]["forces_per_s"] > 0
 
 
-def test_nobody_there_is_said_and_the_status_is_1(capsys, monkeypatch):
+def test_without_broadcasts_the_status_is_1_with_a_message(capsys, monkeypatch):
     monkeypatch.setattr("emb_daemon.monitor.terminal._WAIT_S", 0.2)
     assert main(["monitor", "-i", "virtual", "-c", "nobody", "--once"]) == 1
     error = capsys.readouterr().err
@@ -182,7 +182,7 @@ def test_nobody_there_is_said_and_the_status_is_1(capsys, monkeypatch):
 
 def test_a_summary_names_the_reasons():
     status = wirekit.frame("EMB_FL_EstimatorStatus", 100 * S, Mode=3, DegradedReasons=1 << 8)
-    assert summary(_hear(_force(0), status), 101 * S)[0].endswith("; signal stuck")
+    assert summary(_receive(_force(0), status), 101 * S)[0].endswith("; signal stuck")
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (140, 30)])
@@ -198,7 +198,7 @@ def test_the_demo_is_the_monitor_with_the_truth_beside_it(width, height):
             wirekit.frame(f"EMB_{corner}_PadTemp", 100 * S, InnerSurfaceTemp=512.0, InnerMeanTemp=345.0),
             wirekit.frame(f"EMB_{corner}_EstimatorStatus", 100 * S, Mode=3, DegradedReasons=1 << 8),
         )
-        recorder.note_heard(np.concatenate(frames))
+        recorder.note_received(np.concatenate(frames))
     daemon, live = SimpleNamespace(ticks=10, missed=0), SimpleNamespace(late=0, lost=0)
     console = Console(width=width, height=height, color_system=None, force_terminal=True)
     with console.capture() as capture:
@@ -212,19 +212,19 @@ def test_the_demo_is_the_monitor_with_the_truth_beside_it(width, height):
     assert any("simulated truth" in line for line in lines) and ("info: ready" in lines) == (height > 24)
 
 
-def test_the_truth_beside_an_estimate_is_of_its_moment(monkeypatch):
+def test_the_reference_is_the_true_force_at_the_time_of_the_frames(monkeypatch):
     """While frames are read the car drives on; 60 ms of a stroke would look like an error of 3 kN."""
     recorder, truth = Recorder(("FL",), 1.0), np.zeros(1, TRUTH)
     truth["force"] = 10_000.0
     recorder.note_sent(100 * S, truth)
-    recorder.note_heard(_force(0, 10.0))
-    hear = recorder._listener.hear
+    recorder.note_received(_force(0, 10.0))
+    receive = recorder._listener.receive
 
     def drive_on(frames):
-        hear(frames)
+        receive(frames)
         truth["force"] = 13_310.0
         recorder.note_sent(100 * S + 60_000_000, truth)
 
-    monkeypatch.setattr(recorder._listener, "hear", drive_on)
+    monkeypatch.setattr(recorder._listener, "receive", drive_on)
     [corner] = recorder.present(100 * S)
     assert corner.state(100 * S)["clamp_force_ref_kN"] == 10.0

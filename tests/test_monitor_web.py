@@ -41,7 +41,7 @@ def _broadcasts(now_ns: int, counter: int, force_kN=5.0, status=0, reasons=0, co
 
 def _heard(**what) -> Listener:
     listener = Listener()
-    listener.hear(_broadcasts(100 * SECOND_NS, 0, **what))
+    listener.receive(_broadcasts(100 * SECOND_NS, 0, **what))
     return listener
 
 
@@ -77,7 +77,7 @@ def test_lost_and_damaged_frames_are_counted_apart():
     listener = _heard()
     late = _broadcasts(100 * SECOND_NS, 4)
     late["data"][1] ^= 1 << 60
-    listener.hear(late)
+    listener.receive(late)
     found = _samples(exposition(listener, 100 * SECOND_NS))
     # Three of each of the other kinds of message were lost before these, and one came with a wrong CRC.
     assert found["emb_frames_missing_total", 'corner="FL"'] == 9.0
@@ -110,7 +110,7 @@ def test_page_state_and_metrics_are_served(web):
     assert _get(web.port, "/etc/passwd").status == 404
 
 
-def test_a_name_of_somebody_else_that_leads_here_gets_nothing(web):
+def test_a_request_under_a_foreign_host_name_is_refused(web):
     assert _get(web.port, "/state.json", host="rebound.example").status == 403
     assert _get(web.port, "/state.json", host="localhost").status == 200
 
@@ -121,7 +121,7 @@ def test_it_is_served_on_one_address_alone(web):
         socket.create_connection(("127.0.0.2", web.port), timeout=5.0)
 
 
-def test_a_taken_port_is_told(web, capsys):
+def test_a_taken_port_is_reported(web, capsys):
     assert main(["monitor", "-i", "virtual", "-c", "web-taken", "--web", str(web.port)]) == 1
     assert capsys.readouterr().err == f"--web {web.port}: Address already in use\n"
     for nowhere in ("nowhere", "127.0.0.1:65536"):
@@ -180,7 +180,7 @@ def test_datagrams_and_events_follow_the_broadcasts():
     assert len(history) >= 2 and set(history[-1][1]) == {"FL"} and history[0][0] < history[-1][0]
 
 
-def test_what_was_heard_is_recorded(tmp_path):
+def test_received_broadcasts_are_recorded(tmp_path):
     pytest.importorskip("mcap", reason="NOT RUN: mcap is not installed")
     from mcap.reader import make_reader
 
@@ -188,7 +188,7 @@ def test_what_was_heard_is_recorded(tmp_path):
 
     recording, listener = Recording(tmp_path / "drive.mcap"), Listener()
     for counter in range(3):
-        listener.hear(_broadcasts(100 * SECOND_NS, counter, 5.0 + counter, reasons=1))
+        listener.receive(_broadcasts(100 * SECOND_NS, counter, 5.0 + counter, reasons=1))
         listener.corners[0].facts = [None, [], ["the disc is uneven"]][counter]
         for _ in range(2):  # Nothing new the second time.
             recording.show(listener, 100 * SECOND_NS)
@@ -206,7 +206,7 @@ def test_what_was_heard_is_recorded(tmp_path):
     assert all(kinds[type(value)] in described[name]["type"] for name, value in said.items())
 
 
-def test_what_the_daemon_shares_is_followed(tmp_path, monkeypatch, capsys):
+def test_monitor_passes_the_shared_file_to_page_and_recording(tmp_path, monkeypatch, capsys):
     taken = []
     monkeypatch.setattr("emb_daemon.monitor.web.hand_out", lambda *given: taken.append(given))
     bus, path = ["-i", "virtual", "-c", "web-shared"], tmp_path / "estimates"

@@ -180,7 +180,7 @@ def no_status(pipeline):
     (not_started, "corner FL sends no samples"),
     (no_status, "no vehicle status is received"),
 ])  # fmt: skip
-def test_no_page_is_taken_or_left_but_at_rest(daemon, caplog, circumstance, said):
+def test_a_page_is_taken_or_left_only_at_rest(daemon, caplog, circumstance, said):
     circumstance(daemon.pipeline)
     assert ask(daemon, page({CLEARANCE: 7.0})) == Answer(said, later=True) and in_use(daemon) == of({})
     assert f"page refused: {said}" in caplog.text
@@ -192,7 +192,7 @@ def test_no_page_is_taken_or_left_but_at_rest(daemon, caplog, circumstance, said
         assert ask(daemon, Page({}, {})) == Answer(said, later=True) and in_use(daemon) == of({CLEARANCE: 7.0})
 
 
-def test_a_loop_that_reading_kept_from_hearing_gets_a_moment_to_hear(daemon):
+def test_after_reading_the_loop_gets_time_to_receive(daemon):
     silent(daemon.pipeline)
     request = Request(page({CLEARANCE: 7.0}))
     daemon.ask_page(request)
@@ -216,7 +216,7 @@ def test_pages_are_taken_one_after_the_other(daemon):
     assert first.wait() == second.wait() == Answer()
 
 
-def test_what_could_not_be_checked_is_not_taken(daemon, monkeypatch):
+def test_a_page_that_could_not_be_checked_is_refused(daemon, monkeypatch):
     """Whatever ends the check."""
     monkeypatch.setattr("emb_daemon.runtime.pages.moved", lambda *_, **__: 1 / 0)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
@@ -224,7 +224,7 @@ def test_what_could_not_be_checked_is_not_taken(daemon, monkeypatch):
 
 
 @pytest.mark.parametrize(("asked_s", "taken"), [(1, True), (4, False)])
-def test_a_page_that_was_checked_too_late_is_not_taken(daemon, asked_s, taken):
+def test_a_page_that_was_checked_too_late_is_refused(daemon, asked_s, taken):
     """Whoever asked for it no longer waits."""
     request = Request(page({CLEARANCE: 7.0}))
     request.asked_ns -= asked_s * 10**9
@@ -250,7 +250,7 @@ def test_a_reload_goes_back_to_the_file(daemon):
     assert not daemon._on_page
 
 
-def test_a_page_ends_though_the_file_is_bad_by_then(daemon, folder, caplog):
+def test_a_page_ends_even_if_the_file_is_faulty_by_then(daemon, folder, caplog):
     ask(daemon, page({CLEARANCE: 7.0}))
     (folder / "calibration.yaml").write_text("[")
     daemon.reload()
@@ -314,7 +314,7 @@ def wait(condition, seconds=20.0):
         time.sleep(0.005)
 
 
-def test_a_page_ends_with_who_asked_for_it_and_the_next_may_ask(daemon, folder):
+def test_a_page_ends_with_its_client_and_the_next_client_may_ask(daemon, folder):
     path = socket_path(folder / "estimates")
     assert path.stat().st_mode & 0o777 == 0o600
     with looping(daemon):
@@ -326,7 +326,7 @@ def test_a_page_ends_with_who_asked_for_it_and_the_next_may_ask(daemon, folder):
             wait(lambda: in_use(daemon) == of({}))
 
 
-def test_what_is_no_page_is_refused_and_the_next_is_heard(daemon, folder, caplog):
+def test_a_malformed_page_is_refused_and_the_next_is_accepted(daemon, folder, caplog):
     path, client = socket_path(folder / "estimates"), PageClient(socket_path(folder / "estimates"))
     with looping(daemon):
         for content in (b"{", b"[" * 100_000, b'{"values": {"FL": {"a": null}}, "files": {}}', b'{"values": {}}', b"\xff"):
@@ -340,7 +340,7 @@ def test_what_is_no_page_is_refused_and_the_next_is_heard(daemon, folder, caplog
     wait(lambda: "pages" not in [thread.name for thread in threading.enumerate()])
 
 
-def test_without_the_key_nothing_is_heard_or_written(tmp_path):
+def test_without_a_segment_commands_that_write_are_unknown(tmp_path):
     assert not Setup(CONFIG / "emb.yaml").configuration.xcp.calibrate
     slave = Slave(Image(b""), ON_UDP, lambda: 0, b"", b"")
     assert slave.answer(b"\xff\x00")[1] == 4, "acquisition alone"
@@ -388,11 +388,11 @@ class _Bench:
     (ON_CAN, "d9", "01 07 01 00 52 01 00"), (ON_UDP, "d7 00 00 00", "84 10 02 04 06 00"), (ON_UDP, "e9", "01 00"),
     (ON_UDP, "e8 01 00 00 00", "02 00 00 00 00"), (ON_UDP, "e7 00 00 00", "3f 00"), (ON_UDP, "e7 00 00 01", "0f 00"),
 ])  # fmt: skip
-def test_a_tool_is_told_byte_by_byte_what_the_standard_puts_there(transport, command, said):
+def test_answers_have_the_bytes_of_the_standard(transport, command, said):
     assert _Bench(transport).slave.answer(bytes.fromhex(command)).hex(" ") == f"ff {said}"
 
 
-def test_the_working_page_is_asked_for_when_it_is_set_and_the_files_show_what_they_say():
+def test_setting_the_working_page_asks_the_daemon_and_the_files_page_is_unchanged():
     bench = _Bench()
     assert bench.write(CLEARANCE, 7.0) == b"\xff" and not bench.asked and bench.used() == FILES
     assert bench.read(CLEARANCE) == 7.0
@@ -403,7 +403,7 @@ def test_the_working_page_is_asked_for_when_it_is_set_and_the_files_show_what_th
     assert bench.used() == FILES, "a reload, or another daemon"
 
 
-def test_what_the_daemon_refuses_is_told_and_the_page_stays():
+def test_a_refusal_of_the_daemon_is_reported_and_the_page_stays():
     bench = _Bench()
     for later, error in ((False, RANGE), (True, NOT_NOW)):
         bench.says = Answer("why", later)
@@ -575,7 +575,7 @@ def test_the_codes_of_commands_are_the_standards():
         assert int(types.Command[name]) == command.code
 
 
-def test_numbers_that_stand_elsewhere_have_another_version():
+def test_another_layout_of_numbers_has_another_version():
     without = msgspec.structs.replace(SHIPPED, effects={})
     assert version_of({"FL": SHIPPED}, True) != version_of({"FL": without}, True)
     assert version_of({"FL": SHIPPED}, False) == version_of({"FL": without}, False)

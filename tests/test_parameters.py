@@ -63,7 +63,7 @@ def test_keys_move_together_as_they_do_one_by_one(values):
 
 
 @given(st.sampled_from(_KEYS + _EFFECT_KEYS))
-def test_a_step_is_felt_and_stays_in_bounds_on_one_side(key):
+def test_a_step_has_an_effect_and_stays_in_bounds_on_one_side(key):
     found = parameter(_CALIBRATION, key)
     assert found.value == value_of(_CALIBRATION, key) and found.low <= found.value <= found.high
     assert found.step > 0.0 and math.isfinite(found.step) and found.value + found.step != found.value
@@ -135,7 +135,7 @@ def test_no_text_crashes(key):
 @pytest.mark.parametrize(
     "use", [value_of, lambda calibration, key: moved(calibration, {"contact.clearance_rad": 7.0, key: 1.0})]
 )
-def test_what_is_no_number_is_no_parameter(use, key):
+def test_a_key_without_a_number_is_no_parameter(use, key):
     with pytest.raises(InputError, match=f"^{re.escape(key)}: not a number"):
         use(_CALIBRATION, key)
 
@@ -194,7 +194,7 @@ def test_every_key_of_the_file_acts():
     assert _derived(msgspec.structs.replace(_CALIBRATION, adaptation=off)) != _derived(_CALIBRATION)
 
 
-def test_what_is_no_number_is_declared():
+def test_fields_that_are_no_parameters_are_declared():
     """Fields that are neither parameters nor switches of adaptation: identity and documentation."""
     plain = {name.partition(".")[0].partition("[")[0] for name in _KEYS}
     assert set(Calibration.__struct_fields__) - plain == {"format", "actuator", "terms", "provenance"}
@@ -202,7 +202,7 @@ def test_what_is_no_number_is_declared():
         "enabled", "samples_per_range", "high_force_N"}  # fmt: skip
 
 
-def test_a_key_ends_with_its_unit_and_is_told_without():
+def test_a_key_ends_with_its_unit_and_in_words_has_none():
     """Parameters of effects state theirs beside, too."""
     stated = {p.name: p.unit for effect in REGISTRY for p in effect.parameters}
     assert {name: parameters._unit(name) for name in stated} == stated

@@ -187,18 +187,6 @@ def test_after_a_tenth_of_a_second_of_silence_the_force_is_a_fault_until_the_nex
     assert resumed[-1]["source"] in (r.FUSED, r.STIFFNESS_ONLY) and not resumed[-1]["reasons"] & r.RESOLVER_LOST
 
 
-def test_somebody_else_who_sends_our_messages_is_reported(car):
-    log = _log()
-    foreign = np.zeros(1, FRAME)
-    foreign["can_id"], foreign["length"], foreign["time_ns"] = 0x200, 8, log["time_ns"][len(log) // 2]
-    estimates, _ = _run(car, np.insert(log, len(log) // 2, foreign))
-    shown = (estimates["reasons"] & r.SECOND_SENDER) != 0
-    at = np.searchsorted(estimates["time_ns"], foreign["time_ns"][0], side="right")
-    assert shown[at] and not shown[: at - 1].any(), "from the next sample on"
-    plain, _ = _run(car, log)
-    assert np.array_equal(plain["force"], estimates["force"]), "and changes no force"
-
-
 def test_sample_route_equals_frame_route(car, rig):
     """offline.load_log and estimate against the daemon's pipeline over the same log, bit for bit."""
     from emb_daemon.logs.read import read_frames
@@ -230,7 +218,7 @@ def test_after_a_gap_time_is_what_passed(car, gap):
 
 
 @pytest.mark.parametrize("held_ms", [20, 35, 45])
-def test_a_frame_held_up_on_its_way_changes_nothing(car, held_ms):
+def test_delayed_frames_change_no_estimate(car, held_ms):
     """A burst after a hold-up: the counter says what passed, the clock does not, though it may be closer to another turn."""
     frames = _log()
     late = frames.copy()
@@ -244,7 +232,7 @@ def test_a_frame_held_up_on_its_way_changes_nothing(car, held_ms):
     assert np.array_equal(plain["cycle"], answered["cycle"]) and np.array_equal(plain["force"], answered["force"])
 
 
-def test_a_sender_that_paused_is_believed_to_have_paused(car):
+def test_the_pause_of_a_sender_is_made_up_for(car):
     """20 ms without a frame and a counter that goes on as if nothing were: the time is made up for one sample later."""
     frames = np.concatenate(_sliding(60))
     paused = frames["time_ns"] >= frames["time_ns"][len(frames) // 2]
@@ -266,20 +254,3 @@ def test_logs_at_a_reduced_rate(car, every):
     assert count == 40
     assert np.allclose(pipeline.samples["dt"][1:40], 0.004 * every)
     assert np.all(np.isfinite(pipeline.estimates["force"][:40])) and np.all(pipeline.estimates["sigma"][:40] > 0.0)
-
-
-@pytest.mark.parametrize(
-    ("can_id", "flag"),
-    [(0x120, "has_thermocouple"), (0x180, "has_wheel_speed"), (0x181, "has_wheel_pulse"), (0x182, "has_status")],
-)
-def test_a_slow_input_feeds_the_models_for_two_and_a_half_seconds_after_its_last_frame(car, can_id, flag):
-    frames = wirekit.merged(
-        *(frame for frame in _sliding(800) if frame["can_id"][0] != can_id or frame["time_ns"][0] < 100 * MS)
-    )
-    last_ns = frames["time_ns"][frames["can_id"] == can_id][-1]
-    pipeline = Pipeline(car, ("FL",))
-    pipeline.begin(0)
-    _, count = pipeline.collect(frames)
-    age = pipeline.samples["time_ns"][:count] - last_ns
-    fed = pipeline.samples[flag][:count]
-    assert np.all(fed[(age >= 0) & (age < 2500 * MS)]) and not np.any(fed[age >= 2500 * MS]) and age[-1] > 3000 * MS

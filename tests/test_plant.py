@@ -95,7 +95,7 @@ def settled(car, mode, target, seconds):
     return car
 
 
-def test_one_seed_gives_one_log(calibration, driven):
+def test_equal_seeds_give_equal_logs(calibration, driven):
     plant, frames, truth = driven
     again, truth_again = scenarios.simulate_log(plant, scenarios.city_drive(), seed=7)
     assert same(again, frames)
@@ -125,7 +125,7 @@ def test_force_controller_brings_the_true_force(bare, force):
     assert abs(car.states[0]["speed"]) < 0.05
 
 
-def test_pads_that_gave_way_let_go_and_do_not_pull(calibration):
+def test_pads_that_lose_contact_do_not_pull(calibration):
     """What pads lose while they are held is missing when they are released."""
     effects = {name: {} for name in calibration.effects} | {"clamp_creep": {"share": -0.1, "time_constant_s": 5.0}}
     plant = plant_from_calibration(calibration, effects=effects)
@@ -248,7 +248,7 @@ def test_the_wire_contract_is_kept(calibration):
     assert np.array_equal(resolver, truth["counter"][:, 2])
 
 
-def test_sensors_say_what_is_true(driven):
+def test_sensors_measure_the_true_state(driven):
     plant, frames, truth = driven
     truth = truth[:, 0]
     resolver = Decoder().columns(frames, "EMB_FL_Resolver")
@@ -438,7 +438,7 @@ def test_thickness_variation_shows_at_the_wheels_orders_and_only_when_it_turns(b
     assert np.ptp(truth["force"][1500:, 0]) < 20.0
 
 
-def test_a_late_resolver_reads_the_past(calibration):
+def test_a_late_resolver_reads_an_earlier_angle(calibration):
     plant = plant_from_calibration(calibration, effects={"signal_delay": {"delay_s": 0.003}})
     frames, truth = scenarios.simulate_log(plant, drives.training(plant, 6.0))
     behind = truth["angle"][:, 0] - Decoder().columns(frames, "EMB_FL_Resolver")["MotorAngle"]
@@ -476,7 +476,7 @@ class Parked:
             payload |= pack(float(value), layout["sent"][ADAPT_REQUEST, column])
         frames[0] = (0, protect(can_id, payload, self.counter, 0), can_id, 8, 0)
         self.counter = (self.counter + 1) % COUNTER_MODULO
-        self.car.hear(frames)
+        self.car.receive(frames)
 
 
 @pytest.fixture

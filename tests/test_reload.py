@@ -207,7 +207,7 @@ def test_the_last_of_quick_reloads_counts(daemon, folder):
     assert daemon.pipeline.parameters[0]["clearance"] == 8.0 and reading[:2] == [1, 1]
 
 
-def test_the_service_manager_hears_when_a_reload_begins_and_ends(daemon, folder):
+def test_the_service_manager_gets_begin_and_end_of_a_reload(daemon, folder):
     """Of two quick ones the end is the end of both; a refused file ends one too."""
     said, real = [], daemon._read_calibrations
     daemon._manager.notify = lambda *assignments: said.append(assignments)
@@ -226,7 +226,7 @@ def test_the_service_manager_hears_when_a_reload_begins_and_ends(daemon, folder)
     assert said[-1] == ("READY=1",) and said[-2][0] == "RELOADING=1"
 
 
-def test_what_is_read_is_taken_by_the_loop_alone(daemon, folder):
+def test_only_the_loop_changes_to_what_was_read(daemon, folder):
     """The reader ends between two looks of the loop at what waits: nothing changes under its hands."""
     save_calibration(moved(SHIPPED, {"contact.clearance_rad": 7.0}), folder / "calibration.yaml")
     waiting = daemon._waiting
@@ -256,7 +256,7 @@ def test_a_storm_of_signals_stops_nothing(daemon):
     assert daemon.pipeline.parameters[0] == to_parameters(SHIPPED)
 
 
-def test_what_the_loop_has_read_beside_it_is_not_read_in_real_time():
+def test_the_reader_thread_has_ordinary_scheduling():
     """A thread has the scheduler of the one that starts it: a long file would be read at the loop's own priority."""
     policies = []
 

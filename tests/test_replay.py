@@ -88,7 +88,7 @@ def _cut(first: int, end: int, backplate: float) -> list[np.ndarray]:
     return wirekit.drive(end - first, first=first, backplate=backplate, angle=_ANGLE, speed=_SPEED, current=(1.0,))
 
 
-def test_reasons_stand_in_words_after_the_source_and_a_car_has_no_reference_columns(two_corners):
+def test_reasons_are_words_after_the_source_and_a_car_has_no_reference_columns(two_corners):
     frames = read.read_frames(two_corners / "FL.log")
     lost = np.isin(frames["can_id"], [Decoder().can_id(name) for name in ("EMB_FL_Thermocouple", "VEH_WheelSpeed")])
     (two_corners / "FL.log").write_text(format_candump(frames[~lost | (frames["time_ns"] < 2_500_000_000)]))
@@ -102,7 +102,7 @@ def test_reasons_stand_in_words_after_the_source_and_a_car_has_no_reference_colu
     assert np.array_equal(np.array(table["reasons"].to_pylist()) == "", quiet)
 
 
-def test_what_the_estimator_found_is_told_in_words(two_corners, capsys):
+def test_facts_are_printed_in_words(two_corners, capsys):
     """A reason on the wire has several causes."""
     frames = read.read_frames(two_corners / "FL.log")
     (two_corners / "FL.log").write_text(format_candump(frames[frames["can_id"] != Decoder().can_id("EMB_FL_Thermocouple")]))
@@ -115,7 +115,7 @@ def test_what_the_estimator_found_is_told_in_words(two_corners, capsys):
     assert "temperature unknown" in page.read_text()
 
 
-def test_references_stand_beside_the_estimates(rig, tmp_path, capsys):
+def test_references_are_columns_next_to_the_estimates(rig, tmp_path, capsys):
     log = rig / "static" / "random_0p5mm.log.gz"
     out = tmp_path / "out.parquet"
     assert main(["replay", str(log), "--output", str(out), "--json"]) == 0
@@ -150,7 +150,7 @@ def test_an_output_that_is_an_input_is_refused(two_corners, capsys, monkeypatch,
 
 
 @pytest.mark.parametrize("option", ["--report", "--output"])
-def test_what_is_no_regular_file_is_not_replaced(two_corners, capsys, option):
+def test_pipes_links_to_them_and_folders_are_not_replaced(two_corners, capsys, option):
     """A pipe stands for devices here: root could replace /dev/null, and a link to one."""
     pipe, link = two_corners / "pipe.csv", two_corners / "link.csv"
     os.mkfifo(pipe)

@@ -54,7 +54,7 @@ def test_stretches_begin_and_end_with_what_they_show():
     assert np.allclose(begin, [0.4, 2.0]) and np.allclose(end, [199 * 0.004, 509 * 0.004])
 
 
-def test_an_instant_is_still_seen_and_a_flutter_is_one_stretch():
+def test_one_sample_gives_a_visible_stretch_and_flicker_gives_one_stretch():
     time = np.arange(1_000_000) * 0.004
     active = np.zeros(len(time), bool)
     active[500_000] = True

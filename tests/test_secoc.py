@@ -221,7 +221,7 @@ def estimates_of(frames, pipeline=None):
 NUMBERS = ("cycle", "counter", "force", "sigma", "stiffness_force", "torque_force", "contact_angle", "disc", "mean", "mode")
 
 
-def test_what_stands_on_the_wire():
+def test_authentication_frames_decode_by_the_dbc():
     """By the DBC and other people's codecs: freshness first, then each set's authentication, with its Counter."""
     frames = signed()
     decoded = [wirekit.decode(frame) for frame in frames[np.isin(frames["can_id"], [AUTH, FRESHNESS])][:300]]
@@ -322,7 +322,7 @@ def test_a_lost_freshness_frame_costs_nothing():
     assert taken == len(drive()) and refused == 2, "what authenticates the lost frames is refused, no other"
 
 
-def test_who_lost_more_than_a_reset_waits_for_the_next_freshness_frame():
+def test_after_losing_more_than_a_reset_the_next_freshness_frame_is_needed():
     frames = signed()
     silent = (frames["time_ns"] > _START_NS + 100 * CYCLE_NS) & (frames["time_ns"] < _START_NS + 600 * CYCLE_NS)
     heard = verifier().verify(frames[~silent])
@@ -342,7 +342,7 @@ def test_a_receiver_that_starts_late_is_in_step_with_the_next_freshness_frame():
     assert not np.any(since["flags"][np.isin(since["can_id"], [0x100, 0x110])])
 
 
-def test_what_was_heard_before_a_restart_is_not_believed_after_it():
+def test_frames_from_before_a_restart_are_refused_after_it():
     """Of the same trip and of an older one; the next start of the sender is."""
     first = verifier()
     first.verify(signed())
@@ -365,7 +365,7 @@ def test_the_last_set_comes_no_second_time():
         assert not np.any(repeated["flags"] == 0) and np.any(repeated["flags"] == UNAUTHENTIC)
 
 
-def test_keys_of_others_open_nothing():
+def test_keys_of_other_links_verify_nothing():
     """Each sender has its own: the vehicle's cannot speak for a corner, nor can the daemon's."""
     for name in KEYS:
         if name != "EMB_FL_Auth":
@@ -409,7 +409,7 @@ def test_a_rival_is_refused_with_the_genuine_frame_and_the_next_sample_waits(pla
     )
 
 
-def test_who_is_not_in_step_or_has_no_key_believes_nothing():
+def test_without_freshness_or_key_nothing_is_accepted():
     """Not even what would follow the last reset that was kept: that may have been heard before the restart."""
     late = signed()[of(signed(), FRESHNESS)[1] + 2 : of(signed(), FRESHNESS)[2]]
     corner = late[np.isin(late["can_id"], [0x100, 0x110, 0x120, AUTH])]
@@ -484,7 +484,7 @@ def test_without_a_key_the_status_is_fault(missing, tmp_path):
     assert np.any(sent["can_id"] == 0x240) == (missing != "EMB_FL_EstimateAuth")
 
 
-def test_what_is_sent_is_believed_by_who_has_the_key(tmp_path):
+def test_signed_frames_are_accepted_by_a_receiver_with_the_key(tmp_path):
     daemon = opened(tmp_path)
     pipeline = new_pipeline()
     pipeline.begin(_START_NS)
@@ -504,7 +504,7 @@ class TestFreshnessFile:
     def test_a_trip_counter_is_used_once(self, tmp_path):
         assert [FreshnessFile(tmp_path / "state").begin_trip().trip for _ in range(3)] == [1, 2, 3]
 
-    def test_it_outlives_a_restart_with_what_was_heard(self, tmp_path):
+    def test_after_a_restart_stored_freshness_refuses_played_back_frames(self, tmp_path):
         first = opened(tmp_path)
         assert not first.stale(), "nothing was heard yet"
         first.verify(signed())
@@ -514,13 +514,13 @@ class TestFreshnessFile:
         second = opened(tmp_path)
         assert fresh(second.verify(signed()))[0] == 0 and fresh(second.verify(signed(trip=2)))[0] == len(drive())
 
-    def test_what_was_heard_of_a_corner_that_is_left_out_for_a_while_is_not_forgotten(self, tmp_path):
+    def test_freshness_of_a_corner_that_is_not_configured_now_is_kept(self, tmp_path):
         file = FreshnessFile(tmp_path)
         file.keep(Freshness(heard={"EMB_RR_Auth": (7, 9)}))
         opened(tmp_path).close()
         assert "EMB_RR_Auth" not in [link.name for link in RECEIVED] and file.load().heard["EMB_RR_Auth"] == (7, 9)
 
-    def test_a_bus_that_is_heard_for_long_keeps_what_it_heard(self, tmp_path):
+    def test_received_freshness_is_stored_while_the_bus_runs(self, tmp_path):
         frames, bus = signed(), SimpleNamespace()
         authentication = opened(tmp_path)
         secured_bus = SecuredBus(bus, authentication)
@@ -533,7 +533,7 @@ class TestFreshnessFile:
         authentication._writer.join()
         assert FreshnessFile(tmp_path).load().heard["EMB_FL_Auth"][0] == 1
 
-    def test_one_thread_at_a_time_stores(self, tmp_path, monkeypatch):
+    def test_only_one_thread_stores_freshness_at_a_time(self, tmp_path, monkeypatch):
         """And none where logs are read; what the first had not heard the last one stores."""
         authentication, held, stored = opened(tmp_path), threading.Event(), []
         monkeypatch.setattr(authentication._file, "keep", lambda kept: (held.wait(20.0), stored.append(kept)))
@@ -555,7 +555,7 @@ class TestFreshnessFile:
         assert FreshnessFile(tmp_path).begin_trip().trip == 1
         assert "damaged" in caplog.text and list(tmp_path.glob("*.unusable-1"))
 
-    def test_a_trip_that_cannot_be_kept_does_not_begin(self, tmp_path, monkeypatch):
+    def test_a_trip_that_cannot_be_stored_does_not_begin(self, tmp_path, monkeypatch):
         def full(*_):
             raise OSError(28, "No space left on device")
 
@@ -581,7 +581,7 @@ class TestFreshnessFile:
         assert FreshnessFile(tmp_path).load() == Freshness(trip=2, heard=authentication._verifier.last())
         assert FreshnessFile(tmp_path).begin_trip().trip == 3
 
-    def test_what_could_not_be_stored_is_tried_again_and_told_once(self, tmp_path, monkeypatch, caplog):
+    def test_storing_is_tried_again_and_a_failure_reported_once(self, tmp_path, monkeypatch, caplog):
         def broken(*_):
             raise OSError(5, "Input/output error")
 
@@ -602,7 +602,7 @@ class TestFreshnessFile:
         with pytest.raises(InputError, match="used up"):
             file.begin_trip()
 
-    def test_far_behind_is_what_64_resets_are(self, tmp_path):
+    def test_stored_counters_are_stale_after_64_resets(self, tmp_path):
         authentication = opened(tmp_path)
         authentication.verify(signed())
         authentication.close()
@@ -627,11 +627,11 @@ class TestKeys:
         assert keys == {"EMB_FL_Auth": bytes.fromhex("ab7e151628aed2a6abf7158809cf4f3c"), "VEH_Auth": bytes(range(16))}
 
     @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o602, 0o644, 0o601])
-    def test_what_others_may_read_is_refused(self, tmp_path, mode):
+    def test_a_key_file_readable_by_others_is_refused(self, tmp_path, mode):
         with pytest.raises(InputError, match=f"mode {mode:o}: others may read"):
             load_keys(self.written(tmp_path, self.GOOD, mode), {})
 
-    def test_what_somebody_else_wrote_is_refused(self, tmp_path, monkeypatch):
+    def test_a_key_file_of_another_user_is_refused(self, tmp_path, monkeypatch):
         """He may write to it again whenever he likes."""
         path = self.written(tmp_path, self.GOOD)
         if os.geteuid() == 0:
@@ -665,13 +665,13 @@ class TestKeys:
             ("EMB_FR_Auth 000102030405060708090a0b0c0d0e0f", "keys:5: EMB_FR_Auth: another name has the same key"),
         ],
     )
-    def test_a_bad_line_is_named_and_no_key_is_told(self, tmp_path, line, said):
+    def test_a_bad_line_is_named_without_printing_a_key(self, tmp_path, line, said):
         with pytest.raises(InputError) as error:
             load_keys(self.written(tmp_path, self.GOOD + line), {})
         assert said in str(error.value) and "ab7e15162" not in str(error.value) and "ffeedd" not in str(error.value)
 
     @pytest.mark.parametrize(("name", "said"), [("nothing", "no such file"), (".", "Is a directory")])
-    def test_what_is_no_file(self, tmp_path, name, said):
+    def test_a_missing_key_file_or_a_folder_is_refused(self, tmp_path, name, said):
         os.chmod(tmp_path, 0o700)
         with pytest.raises(InputError, match=said):
             load_keys(tmp_path / name, {})
@@ -684,7 +684,7 @@ def configured(folder, lines):
 
 
 class TestConfiguration:
-    def test_faults_of_keys_are_told_with_the_others(self, tmp_path):
+    def test_a_missing_key_file_is_an_error_of_the_configuration(self, tmp_path):
         with pytest.raises(InputError, match="keys: no such file"):
             Setup(configured(tmp_path, "secoc: {keys: keys}\n"))
 
@@ -696,7 +696,7 @@ class TestConfiguration:
         said = capsys.readouterr().out
         assert "no key EMB_FL_EstimateAuth" in said and "no key EMB_FL_Auth" not in said and "no key VEH_Auth" not in said
 
-    def test_a_dbc_without_the_messages_serves_who_does_not_authenticate(self, tmp_path):
+    def test_without_secoc_a_dbc_needs_no_authentication_messages(self, tmp_path):
         text = resource("dbc/emb.dbc").read_text(encoding="utf-8").replace("EMB_FL_Auth", "EMB_FL_Auht")
         (tmp_path / "other.dbc").write_text(text, encoding="utf-8")
         TestKeys().written(tmp_path, TestKeys.GOOD)
@@ -735,7 +735,7 @@ class TestConfiguration:
             secured.secure(None, setup, None)
 
 
-def test_a_running_daemon_hears_and_says_what_a_replay_of_its_bus_does(tmp_path):
+def test_a_running_daemon_receives_and_sends_what_a_replay_of_its_bus_does(tmp_path):
     """In the midst of forged frames: every genuine sample is answered, with the payload that the recorded bus gives, and who
     has the key believes it."""
     running = Running(Setup(configured(tmp_path, "realtime: {fifo_priority: null, lock_memory: false}\n")))
@@ -760,7 +760,7 @@ def test_a_running_daemon_hears_and_says_what_a_replay_of_its_bus_does(tmp_path)
     assert np.array_equal(answers(believed), answers(pipeline.broadcast(count))) and count == samples
 
 
-def test_without_it_nothing_of_it_is_loaded():
+def test_without_secoc_no_module_of_it_is_loaded():
     modules = "emb_daemon.cli.run, emb_daemon.runtime.daemon, emb_daemon.runtime.bus"
     code = f"import sys; sys.modules['asammdf'] = None; import {modules}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()

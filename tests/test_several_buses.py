@@ -72,7 +72,7 @@ def columns():
 
 
 @pytest.mark.parametrize(("name", "first", "second"), [("a.log", "can0", "can1"), ("a.asc", 1, 2), ("a.blf", 1, 2)])
-def test_one_id_on_two_buses_is_two_messages(columns, tmp_path, name, first, second):
+def test_the_same_id_on_two_buses_means_two_messages(columns, tmp_path, name, first, second):
     mapping = _mapping(tmp_path, first, second)
     numbered = ("can0", "can1") if name == "a.log" else (0, 1)
     with can.Logger(tmp_path / name) as log:
@@ -89,7 +89,7 @@ def test_one_id_on_two_buses_is_two_messages(columns, tmp_path, name, first, sec
         load_log(tmp_path / name, read=_mapping(tmp_path, text=one).read)
 
 
-def test_what_a_gateway_copies_is_one_message(columns, tmp_path):
+def test_a_message_that_a_gateway_copies_is_read_once(columns, tmp_path):
     with can.Logger(tmp_path / "a.log") as log:
         for message in _messages(columns)[::2]:
             log(message)
@@ -116,7 +116,7 @@ def test_a_bus_is_named_where_there_are_several(tmp_path, wrong, said):
         _mapping(tmp_path, text=wrong)
 
 
-def test_several_live_buses_are_heard_by_channel(columns, tmp_path):
+def test_several_live_buses_are_received_by_channel(columns, tmp_path):
     mapping = _mapping(tmp_path, "several_a", "several_b")
     bus = MappedBus(open_buses({"interface": "virtual", "channel": "several_a"}, mapping), mapping)
     senders = {name: can.Bus(interface="virtual", channel=f"several_{name}") for name in "ab"}
@@ -175,7 +175,7 @@ class _Wire:
         self.sent.append(message)
 
 
-def test_the_simulated_car_speaks_as_the_rig_and_is_read_back_alike(tmp_path):
+def test_simulated_messages_in_the_rigs_format_are_read_back_equal(tmp_path):
     mapping = Mapping(foreignkit.write_rig(tmp_path))
     wire = _Wire()
     rig, back = SimulatedRig(wire, mapping, []), MappedBus(_Wire(), mapping)
@@ -207,7 +207,7 @@ def test_simulate_and_monitor_take_a_mapping(tmp_path, capsys):
     force = int(wirekit.frame("EMB_FL_ClampForce", 0, ClampForce=5.0, ClampForceSigma=0.1)["data"][0])
     broadcast.send(can.Message(0.0, 0x200, False, data=force.to_bytes(8, "little")))
     listener = Listener()
-    listener.hear(monitor.drain())
+    listener.receive(monitor.drain())
     now = time.monotonic_ns()
     state = listener.corners[0].state(now)
     assert state["clamp_force_kN"] == 5.0 and abs(state["clamp_force_ref_kN"]) < 0.2

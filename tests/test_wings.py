@@ -46,13 +46,13 @@ def _imports() -> dict[tuple[str, str], set[str]]:
     return found
 
 
-def test_the_box_knows_nothing_of_the_bench_and_each_floor_only_those_below():
+def test_the_box_imports_nothing_of_the_bench_and_packages_import_downwards():
     for (part, to), files in _imports().items():
         if part in _BOX:
             assert to in _BOX[: _BOX.index(part)], f"{', '.join(sorted(files))}: {part} may not know {to}"
 
 
-def test_nobody_knows_the_command_line_and_nothing_shipped_knows_tests_or_studies():
+def test_nothing_imports_cli_and_the_package_imports_no_tests_or_studies():
     for (part, to), files in _imports().items():
         assert to not in {*_ABOVE, "tests", "studies"} or part in _ABOVE, f"{', '.join(sorted(files))}: {part} knows {to}"
 

@@ -54,7 +54,7 @@ _NOT_SHARED = [0xFFFF] * 4 + [0xFFFFFFFF]
 
 def _judge(memory, reasons, times=3, corner=FL, mode=DEGRADED, frame=_FRAME):
     for _ in range(times):
-        memory.judge(corner, mode, reasons, frame, 0.0)
+        memory.evaluate(corner, mode, reasons, frame, 0.0)
     return [memory.entries[code_of(corner, bit)] for bit in range(len(REASONS))]
 
 
@@ -75,7 +75,7 @@ def test_a_code_fails_when_its_reason_stays(tmp_path):
     assert (resolver.occurrences, resolver.frame) == (2, _FRAME), "the first failure's frame stays"
 
 
-def test_before_a_corner_has_heard_anything_nothing_has_failed(tmp_path):
+def test_before_a_corner_has_inputs_no_code_fails(tmp_path):
     entries = _judge(TroubleMemory(tmp_path), 0x3F, times=10, mode=INIT)
     assert all(entry.status == 0x50 for entry in entries)
 
@@ -93,7 +93,7 @@ def test_a_confirmed_code_is_forgotten_after_cycles_without_failure(tmp_path):
     assert not entry.status & (CONFIRMED | PENDING) and entry.frame is None
 
 
-def test_a_cycle_in_which_nothing_was_judged_does_not_count(tmp_path):
+def test_an_operation_cycle_without_a_test_does_not_age_a_code(tmp_path):
     _judge(TroubleMemory(tmp_path), CURRENT_LOST)
     for _ in range(5):
         entry = TroubleMemory(tmp_path).entries[code_of(FL, 1)]
@@ -112,7 +112,7 @@ def test_a_file_of_a_version_without_shared_values_is_read(tmp_path):
     assert not memory.warning and memory.entries[code_of(FL, 1)].frame == _FRAME
 
 
-def test_a_damaged_file_is_set_aside_and_told(tmp_path):
+def test_a_damaged_file_is_set_aside_and_reported(tmp_path):
     _judge(TroubleMemory(tmp_path), CURRENT_LOST)
     path = tmp_path / trouble.FILE
     path.write_bytes(path.read_bytes().replace(b'"occurrences": 1', b'"occurrences": 2'))
@@ -152,7 +152,7 @@ def test_status_bits_never_contradict_each_other(tmp_path_factory, steps):
     ("value", "unsigned", "signed"),
     [(None, "ffff", "8000"), (1e9, "fffe", "7fff"), (-1e9, "0000", "8001"), (3.0, "0003", "001e")],
 )
-def test_no_value_is_taken_for_one_that_is_not_to_be_used(value, unsigned, signed):
+def test_values_saturate_below_the_code_for_invalid(value, unsigned, signed):
     factor = value and 1e-4 * value
     facts = None if value is None else ("zero_wanders", "not_a_number")
     frame = Frame(1, DEGRADED, 2, value, value, (value,) * 4, value, factor, value, value, value, value, facts).encode()
@@ -198,7 +198,7 @@ class _Sharing:
             self.present.follow(self.now_ns)
 
 
-def test_of_each_corner_the_newest_sample_is_told_while_it_is_of_the_present(tmp_path):
+def test_the_newest_sample_of_each_corner_is_available_for_as_long_as_it_is_current(tmp_path):
     sharing = _Sharing(tmp_path / "estimates")
     for row in (_row(torque_force=1.0), _row(RR, torque_force=2.0), _row(torque_force=3.0), _row(is_sample=False)):
         sharing.tell(row)
@@ -220,7 +220,7 @@ def test_of_each_corner_the_newest_sample_is_told_while_it_is_of_the_present(tmp
     (None, "no daemon shares its estimates there"),
     (bytes(shared.SHARED.itemsize), "written by another version of the daemon"),
 ])  # fmt: skip
-def test_why_nothing_is_shared_is_told_when_it_lasts(tmp_path, content, said):
+def test_the_reason_for_missing_estimates_is_reported_when_it_lasts(tmp_path, content, said):
     path = tmp_path / "estimates"
     if content:
         path.write_bytes(content)
@@ -235,7 +235,7 @@ def test_why_nothing_is_shared_is_told_when_it_lasts(tmp_path, content, said):
 
 
 @given(st.binary(min_size=1, max_size=12))
-def test_any_request_has_one_answer_or_a_reason(tmp_path_factory, request_):
+def test_any_request_gets_one_positive_or_negative_response(tmp_path_factory, request_):
     server = Server(TroubleMemory(tmp_path_factory.mktemp("trouble")), {0x1000: lambda: b"abc"})
     response = server.answer(request_, 0.0)
     if not response:
@@ -386,7 +386,7 @@ def test_a_tester_reads_versions_calibration_and_estimates(served):
     assert client.read_data_by_identifier(0x1120).service_data.values[0x1120] == b"not known"
 
 
-def test_what_a_daemon_shares_goes_to_the_corner_that_it_is_of(served, tmp_path):
+def test_shared_estimates_are_assigned_to_their_corner(served, tmp_path):
     server, client = served
     found, later = TABLE["zero_wanders"].sentence + "; " + TABLE["beyond_range"].sentence, time.monotonic_ns() + 10**12
     facts = sum(1 << bit for bit, name in enumerate(TABLE) if name in ("zero_wanders", "beyond_range"))
@@ -403,7 +403,7 @@ def test_what_a_daemon_shares_goes_to_the_corner_that_it_is_of(served, tmp_path)
     assert struct.unpack(Frame.LAYOUT, dtc.snapshots[0].data)[-5:] == (12000, 70, 0xFFFF, 0xFFFF, facts)
 
 
-def test_codes_that_cannot_be_kept_are_told_all_the_same(served, monkeypatch):
+def test_codes_that_cannot_be_stored_can_still_be_read(served, monkeypatch):
     server, client = served
 
     def full(path, content):
@@ -418,7 +418,7 @@ def test_codes_that_cannot_be_kept_are_told_all_the_same(served, monkeypatch):
     assert client.get_number_of_dtc_by_status_mask(CONFIRMED).service_data.dtc_count == 1, "forgotten all the same"
 
 
-def test_what_is_not_there_is_refused(served):
+def test_unsupported_requests_are_refused(served):
     from udsoncan.exceptions import NegativeResponseException
 
     client = served[1]
@@ -513,7 +513,7 @@ def test_the_command_serves_and_a_freeze_frame_survives_its_kill(tmp_path, calib
     assert tuple(name for bit, name in enumerate(TABLE) if facts >> bit & 1) == kept[4]
 
 
-def test_a_trouble_is_said_once(monkeypatch, capsys):
+def test_a_trouble_is_printed_once(monkeypatch, capsys):
     stopped, troubles = [], ["", "full", "full", "", "", "full"]
 
     class Troubled:

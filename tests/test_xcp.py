@@ -104,7 +104,7 @@ def test_every_row_is_taken_once_and_in_order_or_counted_as_lost(tmp_path_factor
     assert len(taken) + missing == loop.rows
 
 
-def test_a_reader_that_keeps_up_loses_nothing_and_one_that_sleeps_is_told(tmp_path):
+def test_a_late_reader_gets_the_number_of_estimates_that_it_lost(tmp_path):
     loop, reader = _Loop(tmp_path / "estimates"), EstimatesReader(tmp_path / "estimates")
     reader.look()
     for _ in range(20):
@@ -134,7 +134,7 @@ def test_a_daemon_that_starts_anew_is_found_and_another_version_is_not_read(tmp_
     assert len(reader.take()[0]) == 0 and reader.trouble == f"{path}: written by another version of the daemon"
 
 
-def test_the_daemon_tells_the_estimates_that_it_sends(tmp_path):
+def test_the_daemon_shares_the_estimates_that_it_sends(tmp_path):
     here, there = socket_pair()
     daemon = Daemon(Setup(_CONFIGURATION), here)
     daemon.share(tmp_path / "estimates")
@@ -244,7 +244,7 @@ class _Acquisition(RuleBasedStateMachine):
         assert self.slave.acquiring or not sent
 
 
-def test_acquisition_in_any_order_sends_nothing_that_no_frame_carries():
+def test_acquisition_commands_in_any_order_keep_the_state_machines_invariants():
     run_state_machine_as_test(_Acquisition, settings=settings(max_examples=40, stateful_step_count=30, deadline=None))
 
 
@@ -263,7 +263,7 @@ def test_without_a_session_only_connect_is_answered():
     ("e1 ff 04 00 00 00 00 00", xcp.SEQUENCE), ("e2 00 00 00 00 00", xcp.OUT_OF_RANGE),
     ("dd 03", xcp.MODE_NOT_VALID), ("d7 00 04 00", xcp.OUT_OF_RANGE),
 ])  # fmt: skip
-def test_what_is_not_there_is_refused(command, code):
+def test_wrong_commands_get_their_error_code(command, code):
     slave = _slave()
     slave.answer(b"\xff\x00")
     assert slave.answer(bytes.fromhex(command)) == bytes([0xFE, code])
@@ -437,7 +437,7 @@ def test_a_prescaler_thins_out_and_a_master_that_ended_is_sent_nothing(over_udp)
     master.connect()
 
 
-def test_a_master_that_misses_data_is_told(over_udp):
+def test_lost_data_are_reported_to_the_master(over_udp):
     served, master, received = over_udp
     _acquire(master, ("clamp_force_N",))
     served.loop.tell(900)
@@ -466,7 +466,7 @@ def test_a_master_acquires_on_the_daemons_kind_of_bus(tmp_path, request):
     served.stop()
 
 
-def test_only_the_master_is_heard():
+def test_only_the_master_is_answered():
     import socket
 
     transport = Udp("127.0.0.1", 0)
@@ -489,7 +489,7 @@ def test_only_the_master_is_heard():
         end.close()
 
 
-def test_a_master_whose_machine_says_that_it_ended_is_forgotten(tmp_path):
+def test_a_master_whose_port_is_closed_is_forgotten(tmp_path):
     import socket
 
     transport = Udp("127.0.0.1", 0)
@@ -557,7 +557,7 @@ def test_the_file_describes_every_number_of_the_calibration_with_unit_and_bounds
     assert conversion.unit == "N.m/A"
 
 
-def test_the_file_has_words_for_codes_and_knows_its_slave(described):
+def test_the_file_has_words_for_codes_and_the_version_of_its_slave(described):
     from pya2l import model
 
     table = described.query(model.CompuVtab).filter_by(name="CT.mode").one()
@@ -580,7 +580,7 @@ def test_wrong_addresses_are_refused(arguments, said, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("given", ["0x800", "-1", "tester"])
-def test_an_id_that_is_none_is_refused_with_what_was_expected(given, capsys):
+def test_an_invalid_id_is_refused_with_what_was_expected(given, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["a2l", "--config", str(_CONFIGURATION), "--output", "x.a2l", f"--request-id={given}"])
     assert ended.value.code == 2

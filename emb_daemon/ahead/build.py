@@ -139,7 +139,7 @@ def linker_for(machine: str) -> list[str]:
     A compiler finds libm; symbols that a bare linker leaves undefined are resolved when the library is loaded.
 
     Raises:
-        Unavailable: none is; the message says which packages have one.
+        Unavailable: none is; the message names packages that have one.
     """
     own = machine == platform.machine()
     prefix = "" if own else f"{machine}-linux-gnu-"
@@ -155,7 +155,7 @@ def linker_for(machine: str) -> list[str]:
 
 
 def _link(elf: bytes, command: list[str]) -> bytes:
-    """The shared object of a relocatable one. Raises Unavailable with what the linker says if it fails."""
+    """The shared object of a relocatable one. Raises Unavailable with the linker's message if it fails."""
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder, "kernels.o"), Path(folder, "kernels.so")
         source.write_bytes(elf)

@@ -1,8 +1,8 @@
 """Kernels compiled ahead, as the daemon finds, checks and calls them: without numba, and without a compiler.
 
 A library is an ELF shared object followed by one line of JSON, the `Manifest`. It is used if it is complete, was made for this
-processor from the sources that are installed (those that mention `emb_daemon.jit` or define records), and if nobody else could
-have written it.
+processor from the sources that are installed (those that mention `emb_daemon.jit` or define records), and if no other user
+could have written it.
 """
 
 import ctypes
@@ -100,8 +100,8 @@ def installed_digest() -> str:
 
 
 def who_else_writes(path: Path) -> str:
-    """Who else could have written a file or folder whose content is executed, or its parent; in words, empty if nobody. Files
-    of root are accepted like one's own, and root accepts files of anybody."""
+    """Which other user could have written a file or folder whose content is executed, or its parent; in words, empty if none.
+    Files of root are accepted like one's own, and root accepts files of all users."""
     for place in (path, path.parent):
         status = place.stat()
         if not status.st_mode & stat.S_ISVTX:
@@ -115,7 +115,7 @@ def who_else_writes(path: Path) -> str:
 
 
 def _is_own_group(number: int) -> bool:
-    """Whether a group is root's, or the one of the user's own name that many systems give each user, and nobody else's."""
+    """Whether a group is root's, or the group of the user's own name that many systems create, without other members."""
     try:
         user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(number)
     except KeyError:

@@ -63,7 +63,7 @@ def main() -> None:
     print("ready", time.process_time(), flush=True)
     bus.wait(300.0)
     bus.drain()
-    live.run(lambda: False, seconds, recorder.note_sent, recorder.note_heard)
+    live.run(lambda: False, seconds, recorder.note_sent, recorder.note_received)
     compared = [recorder.compare(row) for row in range(corners)]
     latency_us = 1e6 * np.concatenate([corner.response_s for corner in compared])
     result = {"samples": sum(corner.samples for corner in compared), "answered": len(latency_us)}

@@ -67,7 +67,7 @@ class _Child:
 
 @contextmanager
 def _temporary_configuration(corners: int) -> Iterator[list]:
-    """Configuration and state folder, as arguments of `bench.served`."""
+    """Configuration and state folder, as arguments of `bench.daemon`."""
     with tempfile.TemporaryDirectory() as folder:
         yield [shipped_configuration(Path(folder), CORNERS[:corners], "log_level: error"), Path(folder) / "state"]
 
@@ -80,29 +80,29 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     in which it shares its estimates.
 
     Returns:
-        What `bench.served` says of the daemon, ``answers`` what `bench.car` says, ``empty_loop`` and ``cyclictest`` (None
-        where there is none), and ``ready``, the daemon's start in ``wall_s`` and ``cpu_s``.
+        The figures that `bench.daemon` prints; under ``answers`` those that `bench.car` prints; ``empty_loop``;
+        ``cyclictest``, None where it is missing; and ``ready``: the daemon's start in ``wall_s`` and ``cpu_s``.
     """
     ours, theirs = connected_sockets()
     car = _Child("car", corners, seconds, _CAR_PRIORITY, theirs)
-    served = None
+    daemon = None
     try:
         with _temporary_configuration(corners) as arguments:
             environment = None if kernels is None else {library.VARIABLE: kernels}
-            served = _Child("served", *arguments, share or "", ours, environment=environment)
+            daemon = _Child("daemon", *arguments, share or "", ours, environment=environment)
             command = [sys.executable, empty.__file__, str(seconds), str(_PRIORITY)]
             with subprocess.Popen(command, stdout=subprocess.PIPE) as nothing:
                 latency = cyclictest(seconds)
                 answers = car.result(seconds + _PATIENCE_S)
-                result = served.stop()
+                result = daemon.stop()
                 result["empty_loop"] = json.loads(nothing.communicate()[0])
     finally:
-        for child in filter(None, (car, served)):
+        for child in filter(None, (car, daemon)):
             child.kill()
         # Not earlier: a bus continues without the car, but a socket fails without its other end.
         ours.close()
         theirs.close()
-    figures = {"corners": corners, "seconds": seconds, "ready": served.ready}
+    figures = {"corners": corners, "seconds": seconds, "ready": daemon.ready}
     return figures | result | {"answers": answers, "cyclictest": latency}
 
 
@@ -116,12 +116,12 @@ def measure_start(cold: bool = False) -> dict[str, float]:
     ours, theirs = connected_sockets()
     with ours, theirs, _temporary_configuration(len(CORNERS)) as arguments, tempfile.TemporaryDirectory() as empty_cache:
         environment = {library.VARIABLE: ""} | ({"NUMBA_CACHE_DIR": empty_cache} if cold else {})
-        served = _Child("served", *arguments, "", ours, environment=environment)
+        daemon = _Child("daemon", *arguments, "", ours, environment=environment)
         try:
-            served.stop()
+            daemon.stop()
         finally:
-            served.kill()
-    return served.ready
+            daemon.kill()
+    return daemon.ready
 
 
 def cyclictest(seconds: float) -> dict[str, float] | None:

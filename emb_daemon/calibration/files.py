@@ -26,7 +26,7 @@ def shipped_calibration() -> Calibration:
 
 
 def calibration_hash(calibration: Calibration) -> str:
-    """Twelve hexadecimal digits over the values, whatever the file's formatting; provenance does not count."""
+    """Twelve hexadecimal digits over the values, independent of formatting and provenance."""
     values = msgspec.to_builtins(msgspec.structs.replace(calibration, provenance=None))
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:12]
 

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _ask(corners: list[str]) -> None:
-    """Ask before deleting: the values may have taken years to learn. Raises InputError: nobody is there to answer, or the
+    """Ask before deleting: the values may have taken years to learn. Raises InputError: the input is no terminal, or the
     answer is no."""
     if not corners:
         return

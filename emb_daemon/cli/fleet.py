@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     return _COMMANDS[arguments.fleet_command][0](arguments)
 
 
-def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list, failed: Callable | None = None) -> list:
+def _work(arguments: argparse.Namespace, text: str, task: Callable, items: list, failed: Callable) -> list:
     """``task`` of every item on the cluster, with a bar on a terminal."""
     from emb_daemon.fleet.cluster import cluster
     from emb_daemon.fleet.cluster import run as run_on
@@ -114,7 +114,7 @@ def _diagnose(arguments: argparse.Namespace) -> int:
     groups = list(dataset.by_unit(dataset.drives(root)).values())
     task = partial(scores.score_unit, root, calibration=calibration, resume=arguments.resume)
     done = _work(arguments, "scoring drives", task, groups, lambda drives, reason: {d.digest: reason for d in drives})
-    silent = {digest: reason for told in done for digest, reason in told.items()}
+    silent = {digest: reason for unusable in done for digest, reason in unusable.items()}
     fleet = scores.read_fleet(root, calibration)
     found = findings.find(fleet, scores.Scorer(calibration).causes, calibration_hash(calibration), factors, silent)
     findings.save(found, root)
@@ -152,8 +152,8 @@ def _learn(arguments: argparse.Namespace) -> int:
     groups = list(dataset.by_unit(dataset.drives(root)).values())
     task = partial(learning.learn_unit, root, calibration=calibration, resume=arguments.resume)
     done = _work(arguments, "learning", task, groups, _fault)
-    learned = [told for told in done if not isinstance(told, str)]
-    print(f"{len(learned)} units, {sum(told['trainings'] for told in learned)} trainings accepted")
+    learned = [result for result in done if not isinstance(result, str)]
+    print(f"{len(learned)} units, {sum(result['trainings'] for result in learned)} trainings accepted")
     _print_faults([text for text in done if isinstance(text, str)])
     return 0
 
@@ -163,10 +163,10 @@ def _prior(arguments: argparse.Namespace) -> int:
     from emb_daemon.fleet.learning import prior
 
     check_output(arguments.output, (arguments.calibration,), (".yaml",))
-    calibration, told = prior(arguments.data.absolute(), load_chosen(arguments.calibration))
+    calibration, population = prior(arguments.data.absolute(), load_chosen(arguments.calibration))
     save_calibration(calibration, arguments.output)
-    for key, (mean, sigma, spread, units) in told.items():
-        print(f"{key}: {mean:.6g} ± {sigma:.2g}, spread {spread:.2g} over {units} units")
+    for key, found in population.items():
+        print(f"{key}: {found.mean:.6g} ± {found.sigma:.2g}, spread {found.spread:.2g} over {found.units} units")
     return 0
 
 

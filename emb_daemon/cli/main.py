@@ -67,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     command = _parser().parse_known_args(argv[:1])[0].command
     if own_process and command not in _WITHOUT_NUMBA:
-        # Elsewhere python-can may be wanted for MDF4 by who calls.
+        # Not in a process of a caller, who may need python-can with asammdf.
         importlib.import_module("emb_daemon.wire.light_can")
     module = importlib.import_module(f"emb_daemon.cli.{command}")
     parser = argparse.ArgumentParser(

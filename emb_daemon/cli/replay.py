@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _calibration(arguments: argparse.Namespace):
-    """The calibration with the pads that are mounted; prints to stderr if it is none of this brake, or of a brake at all."""
+    """The calibration with the mounted pads; prints to stderr if it is that of another actuator, or not of a brake."""
     from emb_daemon.calibration.parameters import moved
 
     calibration = load_chosen(arguments.calibration)

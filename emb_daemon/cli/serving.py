@@ -1,4 +1,4 @@
-"""Main loop of the servers that run beside the daemon."""
+"""Main loop of the servers that run as processes of their own next to the daemon."""
 
 import signal
 import sys

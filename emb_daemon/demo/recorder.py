@@ -69,7 +69,7 @@ class Recorder:
         self.sent_ns[self.cycles] = time_ns
         self.cycles += 1
 
-    def note_heard(self, frames: np.ndarray) -> None:
+    def note_received(self, frames: np.ndarray) -> None:
         """Note frames that were received from the bus."""
         room = min(len(frames), len(self.frames) - self.count)
         self.frames[self.count : self.count + room] = frames[:room]
@@ -77,14 +77,14 @@ class Recorder:
         self.count += room
 
     def present(self, now_ns: int) -> list[Corner]:
-        """The corners as the monitor knows them from their broadcasts so far, with the true force as reference."""
+        """The corners as the monitor has them from the broadcasts so far, with the true force as reference."""
         # The car drives on while the frames are read: the reference is that of the last of them.
         count, forces = self.count, self.truth["force"][self.cycles - 1]
-        self._listener.hear(self.frames[self._listened : count])
+        self._listener.receive(self.frames[self._listened : count])
         self._listened = count
         corners = [self._listener.corners[CORNERS.index(name)] for name in self.corners]
         for corner, force_N in zip(corners, forces, strict=True):
-            corner.refer(force_N, now_ns)
+            corner.set_reference(force_N, now_ns)
         return corners
 
     def recent_responses(self) -> np.ndarray:

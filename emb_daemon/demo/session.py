@@ -86,7 +86,7 @@ class Session:
 
     def run(self, show: Callable[[], None], period_s: float) -> None:
         """Drive, calling ``show()`` in this thread every ``period_s``; ends early and cleanly on KeyboardInterrupt."""
-        drive = (self._stop.is_set, self.seconds, self.recorder.note_sent, self.recorder.note_heard)
+        drive = (self._stop.is_set, self.seconds, self.recorder.note_sent, self.recorder.note_received)
         daemon = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY, self.daemon.run), name="daemon")
         # The car has priority, because a real car does not wait for the daemon.
         car = threading.Thread(target=self._guard, args=(_DAEMON_PRIORITY + 1, self.live.run, *drive), name="car")

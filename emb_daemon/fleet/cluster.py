@@ -52,41 +52,51 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
     # Arrow's own allocator would keep the memory that the largest drive took.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     import dask
+
+    with (
+        dask.config.set(_SETTINGS | {"distributed.scheduler.allowed-failures": _LIVES}),
+        _connect(address) if address else _start_workers(workers or len(os.sched_getaffinity(0))) as client,
+    ):
+        yield client
+
+
+def _connect(address: str) -> "Client":
+    from distributed import Client
+
+    try:
+        return Client(address, timeout=_PATIENCE_S)
+    except (OSError, TimeoutError):
+        raise Unavailable(f"{address}: no scheduler answers there") from None
+    except ValueError as error:
+        raise InputError(f"--scheduler {address}: {error}, expected tcp://HOST:PORT") from None
+
+
+@contextlib.contextmanager
+def _start_workers(count: int) -> Iterator["Client"]:
+    """A client of ``count`` processes of this machine, which end with the context."""
     from distributed import Client, LocalCluster
 
-    with dask.config.set(_SETTINGS | {"distributed.scheduler.allowed-failures": _LIVES}):
-        if address:
+    local = LocalCluster(
+        n_workers=count,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.ERROR,
+        preload=["emb_daemon.wire.light_can"],
+    )
+    try:
+        with Client(local) as client:
             try:
-                client = Client(address, timeout=_PATIENCE_S)
-            except (OSError, TimeoutError):
-                raise Unavailable(f"{address}: no scheduler answers there") from None
-            except ValueError as error:
-                raise InputError(f"--scheduler {address}: {error}, expected tcp://HOST:PORT") from None
-            with client:
                 yield client
-            return
-        count = workers or len(os.sched_getaffinity(0))
-        local = LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.ERROR,
-            preload=["emb_daemon.wire.light_can"],
-        )
-        try:
-            with Client(local) as client:
-                try:
-                    yield client
-                finally:
-                    # Distributed cannot close a worker that it is just starting again after its death.
-                    with contextlib.suppress(TimeoutError):
-                        client.wait_for_workers(count, timeout=_PATIENCE_S)
-        finally:
-            # Results are in files. A worker that could not be closed, or that died before distributed had heard of its start,
-            # ends with this process.
-            with contextlib.suppress(AssertionError, KeyError):
-                local.close()
+            finally:
+                # Distributed cannot close a worker that it is just starting again after its death.
+                with contextlib.suppress(TimeoutError):
+                    client.wait_for_workers(count, timeout=_PATIENCE_S)
+    finally:
+        # Results are in files. A worker that could not be closed, or that died before distributed registered it, ends with
+        # this process.
+        with contextlib.suppress(AssertionError, KeyError):
+            local.close()
 
 
 _Item = TypeVar("_Item")

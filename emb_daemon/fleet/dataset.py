@@ -39,7 +39,7 @@ _FORMAT, _KEY = 1, b"emb_daemon"
 #: Rows that are read at once.
 _ROWS = 1 << 14
 _FORCE = "clamp_force_ref_N"
-#: Columns that a data set of format 1 may lack, because it is older than the reading of force sensors. Zero: none was heard.
+#: Columns that a data set of format 1 may lack, because it is older than the support of force sensors. Zero: no sensor.
 _OPTIONAL = {"sensor_force", "has_sensor_force"}
 
 

@@ -17,12 +17,12 @@ from emb_daemon.fleet.population import (
     Difference,
     Directions,
     Readings,
-    centres,
-    changing,
-    outliers,
-    random_effects,
-    shared_causes,
-    unit_of,
+    estimate_random_effects,
+    find_centres,
+    find_outliers,
+    find_shared_causes,
+    find_slope_directions,
+    fit_unit,
 )
 from emb_daemon.fleet.scores import Cause, Score
 
@@ -35,7 +35,7 @@ _LEAST_DAYS, _LEAST_K = 5, 5.0
 _LEAST_SHARED_N, _LEAST_UNIT_N = 10.0, 36.0
 #: Number of points of a trend.
 _WINDOWS = 8
-#: Least number of drives of a unit for its own scatter, and for slopes over two covariates in addition.
+#: Least number of drives of a unit from which its scatter is known, and from which slopes over two covariates are too.
 _LEAST_DRIVES, _SLOPE_DRIVES = 3, 6
 ALL = "all units"
 
@@ -216,8 +216,9 @@ class _Study:
         columns = [self._columns(scores, days) for scores, days in zip(self.scores, self.days, strict=True)]
         #: The directions in which units may differ, by covariate.
         self.free = [np.eye(self.directions.basis.shape[1])]
-        self.free += [changing(self.scores, self.directions, slope) for slope in zip(*(c.T[1:] for c in columns), strict=True)]
-        self.units = [unit_of(s, self.directions, c, self.free) for s, c in zip(self.scores, columns, strict=True)]
+        for covariate in zip(*(c.T[1:] for c in columns), strict=True):
+            self.free.append(find_slope_directions(self.scores, self.directions, covariate))
+        self.units = [fit_unit(s, self.directions, c, self.free) for s, c in zip(self.scores, columns, strict=True)]
         named = sorted({name for levels in factors.values() for name in levels})
         # Corners differ by design: front and rear brakes are different.
         self.levels = {"corner": np.array([corner for _, corner in self.keys])}
@@ -245,27 +246,27 @@ class _Study:
         row = self.covariates.index(covariate)
         free = self.free[row]
         vectors = np.array([unit.values[row] for unit in self.units]) @ free
-        centre = centres(vectors, self.levels)
+        centre = find_centres(vectors, self.levels)
         noise = free.T @ np.array([unit.noise[row] for unit in self.units]) @ free
         freedom = np.array([unit.freedom for unit in self.units])
-        return vectors, vectors - centre, Readings(vectors, centre, self.directions.prints_in(free), noise, freedom)
+        return vectors, vectors - centre, Readings(vectors, centre, self.directions.signatures_in(free), noise, freedom)
 
     def findings(self, calibration: str, silent: dict[str, str], left_out: dict[str, str]) -> Findings:
-        level, apart, readings = self.read("level")
-        groups = shared_causes(level, self.groups, readings, beside=True)
+        level, centred, readings = self.read("level")
+        groups = find_shared_causes(level, self.groups, readings, against_others=True)
         over: dict[str, list[Finding]] = {"day": [], "warmth": []}
         ageing: list[Finding] = []
         for name in self.covariates[1:]:
-            slopes, uneven, own = self.read(name)
+            slopes, centred_slopes, slope_readings = self.read(name)
             # The season of a cause that acts by a temperature would be the curvature of its law, and a misfit of the heat
             # model looks like it. It is the same in all units: more of them only make it more significant; no batch shows it.
             thermal = [row for row, cause in enumerate(self.causes) if cause.thermal and name == "warmth"]
-            shared = shared_causes(slopes, {ALL: self.masks[ALL]}, own, beside=False, misfits=thermal)
-            shared += shared_causes(slopes, self.groups, own, beside=True)
+            shared = find_shared_causes(slopes, {ALL: self.masks[ALL]}, slope_readings, against_others=False, misfits=thermal)
+            shared += find_shared_causes(slopes, self.groups, slope_readings, against_others=True)
             over[name] = self._list_shared(shared, _ACTIONS[name])
             if name == "day":
-                ageing = self._outliers(uneven, own, _ACTIONS["ageing"])
-        unlike = self._outliers(apart, readings, _ACTIONS["unit"])
+                ageing = self._outliers(centred_slopes, slope_readings, _ACTIONS["ageing"])
+        outlying = self._outliers(centred, readings, _ACTIONS["unit"])
         return Findings(
             calibration=calibration,
             first_day=day_of(self.start),
@@ -278,19 +279,19 @@ class _Study:
             groups=self._list_shared(groups, _ACTIONS["level"]),
             drifts=over["day"],
             seasons=over["warmth"],
-            outliers=unlike,
+            outliers=outlying,
             ageing=ageing,
-            units=self._place_units(apart, readings, {finding.where for finding in (*unlike, *ageing)}),
+            units=self._place_units(centred, readings, {finding.where for finding in (*outlying, *ageing)}),
             population=self._population(level, readings),
             trends=self._trends([*groups][:3], over["day"], readings),
         )
 
     def _finding(self, where: str, units: int, one: Difference, action: Callable[[Cause], str]) -> Finding:
-        own, size = self.causes[one.cause], float(self.directions.size_N[one.cause])
+        cause, size = self.causes[one.cause], float(self.directions.size_N[one.cause])
         return Finding(
-            where=where, units=units, cause=own.name, key=own.key, shape=own.shape, amount=one.amount, sigma=one.sigma,
-            unit=own.unit, size_N=one.amount * size, sigma_N=one.sigma * size, chance=one.chance, action=action(own),
-            rivals=tuple(dict.fromkeys(self.causes[r].name for r in one.rivals if self.causes[r].name != own.name)),
+            where=where, units=units, cause=cause.name, key=cause.key, shape=cause.shape, amount=one.amount, sigma=one.sigma,
+            unit=cause.unit, size_N=one.amount * size, sigma_N=one.sigma * size, chance=one.chance, action=action(cause),
+            rivals=tuple(dict.fromkeys(self.causes[r].name for r in one.rivals if self.causes[r].name != cause.name)),
         )  # fmt: skip
 
     def _list_shared(self, shared: Sequence[Difference], action: Callable[[Cause], str]) -> list[Finding]:
@@ -298,11 +299,11 @@ class _Study:
         return [one for one in found if abs(one.size_N) >= _LEAST_SHARED_N]
 
     def _outliers(self, deviations: np.ndarray, readings: Readings, action: Callable[[Cause], str]) -> list[Finding]:
-        found = [self._finding(" ".join(self.keys[one.where]), 1, one, action) for one in outliers(deviations, readings)]
+        found = [self._finding(" ".join(self.keys[one.where]), 1, one, action) for one in find_outliers(deviations, readings)]
         return [one for one in found if abs(one.size_N) >= _LEAST_UNIT_N]
 
     def _place_units(self, deviations: np.ndarray, readings: Readings, named: set[str]) -> list[Placed]:
-        amounts, rows = readings.of(deviations), readings.ordinary
+        amounts, rows = readings.amounts(deviations), readings.ordinary
         spread = np.sqrt((amounts[rows] ** 2).mean(axis=0))
         worst = np.argmax(np.abs(amounts) / spread, axis=1)
         result = []
@@ -319,15 +320,15 @@ class _Study:
         return result
 
     def _population(self, level: np.ndarray, readings: Readings) -> list[Spread]:
-        amounts, noise = readings.of(level), readings.noise()
+        amounts, noise = readings.amounts(level), readings.noise()
         result = []
         for row, cause in enumerate(self.causes):
             size = self.directions.size_N[row]
-            own = random_effects(amounts[readings.ordinary, row], noise[readings.ordinary, row])
+            effects = estimate_random_effects(amounts[readings.ordinary, row], noise[readings.ordinary, row])
             result.append(
                 Spread(
-                    cause=str(cause), key=cause.key, unit=cause.unit, mean=own.mean, spread=own.spread,
-                    mean_N=float(own.mean * size), spread_N=float(own.spread * size),
+                    cause=str(cause), key=cause.key, unit=cause.unit, mean=effects.mean, spread=effects.spread,
+                    mean_N=float(effects.mean * size), spread_N=float(effects.spread * size),
                     noise_N=float(np.median(noise[:, row]) * size),
                 )
             )  # fmt: skip
@@ -352,7 +353,7 @@ class _Study:
                 ]
                 if len(window) < _LEAST_DRIVES:
                     continue
-                pooled = unit_of(window, self.directions, np.ones((len(window), 1)), self.free[:1])
+                pooled = fit_unit(window, self.directions, np.ones((len(window), 1)), self.free[:1])
                 days.append(float(0.5 * (low + high)))
                 sizes.append(float(reading @ pooled.values[0] * size))
                 sigmas.append(float(np.sqrt(reading @ pooled.noise[0] @ reading) * size))
@@ -362,8 +363,8 @@ class _Study:
 
 def _manoeuvre(cause: Cause) -> str:
     """Words for the manoeuvre that makes a cause visible."""
-    told = next((effect.manoeuvre for effect in REGISTRY if effect.name == cause.name), "")
-    return f"to see it: {told or 'slow and fast strokes over all forces'}"
+    manoeuvre = next((effect.manoeuvre for effect in REGISTRY if effect.name == cause.name), "")
+    return f"to see it: {manoeuvre or 'slow and fast strokes over all forces'}"
 
 
 _ACTIONS: dict[str, Callable[[Cause], str]] = {

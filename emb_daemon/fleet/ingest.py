@@ -137,8 +137,8 @@ def ingest_frames(
 
 def _count_refused(pipeline: Pipeline, index: int) -> dict[str, int]:
     """Number of refused frames by verdict: those of the corner and of the car."""
-    own = pipeline.receptions["count"][CORNER_MESSAGES * index : CORNER_MESSAGES * (index + 1)].sum(axis=0)
-    counts = own + pipeline.receptions["count"][WHEEL_SPEED:].sum(axis=0)
+    corner = pipeline.receptions["count"][CORNER_MESSAGES * index : CORNER_MESSAGES * (index + 1)].sum(axis=0)
+    counts = corner + pipeline.receptions["count"][WHEEL_SPEED:].sum(axis=0)
     return {VERDICTS[verdict]: int(counts[verdict]) for verdict in range(BAD_LENGTH, len(VERDICTS)) if counts[verdict]}
 
 

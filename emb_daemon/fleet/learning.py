@@ -16,7 +16,7 @@ from emb_daemon.calibration.types import Calibration, Provenance, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import PARAMETERS, new_state
 from emb_daemon.fleet.dataset import Drive, made_by, partition, read_drive, write_json
-from emb_daemon.fleet.population import LEAST_UNITS, RandomEffects, random_effects
+from emb_daemon.fleet.population import LEAST_UNITS, RandomEffects, estimate_random_effects
 from emb_daemon.offline import estimate
 
 #: Width of adaptation's bounds, in standard deviations between units: one unit in 16 000 of a normal population is outside.
@@ -37,10 +37,10 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
         InputError: a drive's file is missing or damaged.
     """
     corner, path = drives[0].corner, learned_path(root, drives[0].unit, drives[0].corner)
-    told = {"made_by": made_by(calibration), "drives": [drive.digest for drive in drives]}
+    result = {"made_by": made_by(calibration), "drives": [drive.digest for drive in drives]}
     if resume and path.exists():
         known = json.loads(path.read_bytes())
-        if told.items() <= known.items():
+        if result.items() <= known.items():
             return known
     trainings = []
     with tempfile.TemporaryDirectory() as state:
@@ -57,46 +57,45 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
                 # A full history drops its oldest entry for a new one.
                 new = after.history[len(before.history) if before else 0 :] or after.history[-1:]
                 trainings += [{"day": drive.day, **msgspec.to_builtins(entry)} for entry in new]
-    told |= {"unit": drives[0].unit, "corner": corner, "entries": trainings}
-    told["trainings"] = sum(bool(entry["values"]) for entry in trainings)
-    write_json(path, told)
-    return told
+    result |= {"unit": drives[0].unit, "corner": corner, "entries": trainings}
+    result["trainings"] = sum(bool(entry["values"]) for entry in trainings)
+    write_json(path, result)
+    return result
 
 
-def population(root: Path, calibration: Calibration) -> dict[str, tuple[RandomEffects, int]]:
-    """Random effects of the last accepted trainings of all units, by key of the calibration, and the number of units."""
+def population(root: Path, calibration: Calibration) -> dict[str, RandomEffects]:
+    """Random effects of the last accepted trainings of all units, by key of the calibration."""
     values: dict[str, list[tuple[float, float]]] = {}
     for path in sorted(Path(root, "learned").glob("unit=*/corner=*.json")):
-        told = json.loads(path.read_bytes())
-        accepted = [entry for entry in told["entries"] if entry["values"]]
-        if told.get("made_by") != made_by(calibration) or not accepted:
+        stored = json.loads(path.read_bytes())
+        accepted = [entry for entry in stored["entries"] if entry["values"]]
+        if stored.get("made_by") != made_by(calibration) or not accepted:
             continue
         for key, value in accepted[-1]["values"].items():
             # A value without a standard deviation is set together with others, such as the curves next to the mounted pads'
             # thickness.
             values.setdefault(key, []).append((value, accepted[-1]["sigmas"].get(key, 0.0)))
-    return {key: (random_effects(*map(np.array, zip(*pairs, strict=True))), len(pairs)) for key, pairs in values.items()}
+    return {key: estimate_random_effects(*map(np.array, zip(*pairs, strict=True))) for key, pairs in values.items()}
 
 
-def prior(root: Path, calibration: Calibration) -> tuple[Calibration, dict[str, tuple[float, float, float, int]]]:
+def prior(root: Path, calibration: Calibration) -> tuple[Calibration, dict[str, RandomEffects]]:
     """Calibration for the next unit of this kind: the population's means, with the standard deviation between units as sigma
     of each key and of the clearance, and bounds of adaptation from their spread.
 
     Returns:
-        (calibration, {key: (mean, its standard deviation, spread between units, units)}).
+        (calibration, the population's random effects by key).
 
     Raises:
         InputError: too few units have an accepted training.
     """
-    learned = population(root, calibration)
-    least = 2 * LEAST_UNITS
-    learned = {key: (own, units) for key, (own, units) in learned.items() if units >= least and not key.startswith("noise.")}
+    least, learned = 2 * LEAST_UNITS, population(root, calibration)
+    learned = {key: found for key, found in learned.items() if found.units >= least and not key.startswith("noise.")}
     if not learned:
         raise InputError(
             f"{root}: fewer than {least} units with an accepted training; run emb-daemon fleet learn on drives with one"
         )
-    result = moved(calibration, {key: own.mean for key, (own, _) in learned.items()}, checked=True)
-    widths = {key: float(np.hypot(own.spread, own.sigma)) for key, (own, _) in learned.items()}
+    result = moved(calibration, {key: found.mean for key, found in learned.items()}, checked=True)
+    widths = {key: float(np.hypot(found.spread, found.sigma)) for key, found in learned.items()}
     limits, contact = result.adaptation, result.contact
     high = result.training_force_N
     friction = value_of(result, OFFSET_FRICTION) + value_of(result, LOAD_FRICTION) * high
@@ -108,4 +107,4 @@ def prior(root: Path, calibration: Calibration) -> tuple[Calibration, dict[str, 
     old = result.provenance or Provenance(date="", tool="")
     provenance = msgspec.structs.replace(old, tool="emb-daemon fleet prior", sigmas=dict(old.sigmas) | widths)
     result = msgspec.structs.replace(result, adaptation=limits, contact=contact, provenance=provenance)
-    return result, {key: (own.mean, own.sigma, own.spread, units) for key, (own, units) in learned.items()}
+    return result, learned

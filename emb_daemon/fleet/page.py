@@ -28,10 +28,10 @@ def fleet_page(root: Path) -> Page:
         f"{found.drives} drives from {found.first_day} to {found.last_day}, calibration {found.calibration}, without force "
         f"sensors: judged by how the two force paths of each unit disagree. emb_daemon {__version__}",
     )
-    unlike = [*found.outliers, *found.ageing]
-    page.verdict(not (found.groups or unlike), _headline(found))
-    accused = [*found.groups, *unlike[:_WORST], *found.drifts, *found.seasons]
-    actions = [f"{one.where}: {_words(one.cause)}, {one.size_N:+.0f} N. {one.action}" for one in accused]
+    outlying = [*found.outliers, *found.ageing]
+    page.verdict(not (found.groups or outlying), _headline(found))
+    listed = [*found.groups, *outlying[:_WORST], *found.drifts, *found.seasons]
+    actions = [f"{one.where}: {_words(one.cause)}, {one.size_N:+.0f} N. {one.action}" for one in listed]
     page.section("What to do next").items(actions or ["Nothing: the units differ no more than healthy units do."])
     caption = (
         "Difference between a group and all other units: RMS of the force in contact ± one standard deviation, "
@@ -46,12 +46,12 @@ def fleet_page(root: Path) -> Page:
         "One mark for each unit: its largest difference from its group, in standard deviations of ordinary units. "
         f"Ringed ones are named below. The colour is full at {_FULL:g}.",
     )
-    more = f" {len(unlike) - _WORST} more in findings.json." if len(unlike) > _WORST else ""
+    more = f" {len(outlying) - _WORST} more in findings.json." if len(outlying) > _WORST else ""
     caption = (
         "Difference from the unit's own group, worst first; chance that a row is false (Benjamini and Hochberg): these "
         f"units are only inspected in a workshop.{more}"
     )
-    _table(page, "Units that differ from the others", unlike[:_WORST], caption, "No unit is proven to differ.")
+    _table(page, "Units that differ from the others", outlying[:_WORST], caption, "No unit is proven to differ.")
     _trends(page, found)
     _population(page, found)
     _data(page, root, found)

@@ -17,12 +17,12 @@ import numpy as np
 
 from emb_daemon.fleet.scores import Score
 
-#: Directions whose information is below this share of the strongest one's are dominated by rounding and curvature.
-_TOLD_APART = 1e-5
+#: Directions whose information is below this share of the strongest one's are dominated by rounding and nonlinearity.
+_DISTINGUISHABLE = 1e-5
 #: Least share of a slope's information that is left where levels are free too: the error of the slope then at most doubles.
 _SLOPE = 0.25
-#: Information, as a share of the drives', with which a direction is drawn to zero.
-_HELD = 0.01
+#: Information of the prior that every direction is zero, as a share of an average drive's.
+_RIDGE = 0.01
 #: Share of units in the first estimate of the population's scatter, and number of passes after which it no longer changes.
 _CORE, _PASSES = 0.75, 20
 #: A unit whose distance is above this quantile of its chi-square is left out of the population's mean and scatter.
@@ -37,12 +37,12 @@ class Directions:
 
     Attributes:
         basis: shape (causes, directions): scores times this are the coordinates of scores.
-        prints: shape (causes, directions): vector of one unit of each cause.
+        signatures: shape (causes, directions): vector of one unit of each cause.
         size_N: RMS (N) of one unit of each cause over samples in contact, without the contact angle.
     """
 
     basis: np.ndarray
-    prints: np.ndarray
+    signatures: np.ndarray
     size_N: np.ndarray
 
     @classmethod
@@ -51,20 +51,20 @@ class Directions:
         samples = np.mean([score.loaded for score in scores])
         scale = np.sqrt(np.maximum(np.diag(total), 1e-300))
         strength, vectors = np.linalg.eigh(total / np.outer(scale, scale))
-        kept = strength > _TOLD_APART * strength[-1]
+        kept = strength > _DISTINGUISHABLE * strength[-1]
         strength, vectors = strength[kept], vectors[:, kept]
         return cls(
             basis=vectors / np.sqrt(strength) / scale[:, None],
-            prints=vectors * np.sqrt(strength) * scale[:, None],
+            signatures=vectors * np.sqrt(strength) * scale[:, None],
             size_N=scale / np.sqrt(samples),
         )
 
-    def prints_in(self, free: np.ndarray) -> np.ndarray:
-        """Prints by their coordinates in the span of ``free``, orthonormal columns of shape (q, r); zero for a cause most of
-        which is outside."""
-        inside = self.prints @ free
-        told = (inside**2).sum(axis=1) >= _SLOPE * (self.prints**2).sum(axis=1)
-        return inside * told[:, None]
+    def signatures_in(self, free: np.ndarray) -> np.ndarray:
+        """Signatures by their coordinates in the span of ``free``, orthonormal columns of shape (q, r); zero for a cause that
+        is mostly outside of it."""
+        inside = self.signatures @ free
+        mostly_inside = (inside**2).sum(axis=1) >= _SLOPE * (self.signatures**2).sum(axis=1)
+        return inside * mostly_inside[:, None]
 
 
 @dataclass(frozen=True)
@@ -82,34 +82,37 @@ class Unit:
     freedom: int
 
 
-def changing(units: Sequence[Sequence[Score]], directions: Directions, covariates: Sequence[np.ndarray]) -> np.ndarray:
-    """Directions, orthonormal columns of shape (q, r), whose change with a covariate is no level of other directions.
+def find_slope_directions(
+    units: Sequence[Sequence[Score]], directions: Directions, covariates: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Directions, orthonormal columns of shape (q, r), in which a slope over a covariate can be distinguished from levels.
 
-    A torque constant that changes with the ambient temperature makes the force of a constant fade with temperature. Were both
-    free, they would cancel each other and explain with hundreds of newtons what is the misfit of a model.
+    For example, a torque constant that changes with the ambient temperature has the same force as a constant fade of the
+    torque constant with temperature. If both were free, they would cancel each other with hundreds of newtons each, and
+    explain the misfit of a model.
 
     Args:
         covariates: of each unit's drives.
     """
-    basis, left, square = directions.basis, 0.0, 0.0
+    basis, remaining, square = directions.basis, 0.0, 0.0
     for scores, covariate in zip(units, covariates, strict=True):
         information = np.array([basis.T @ score.products[:-1, :-1] @ basis for score in scores])
-        own = covariate - covariate.mean()
-        level = information.sum(axis=0) + _HELD * len(scores) * np.eye(basis.shape[1])
-        both = np.einsum("d,dab->ab", own, information)
-        left = left + np.einsum("d,dab->ab", own**2, information) - both @ np.linalg.solve(level, both)
-        square += float(own @ own)
+        centred = covariate - covariate.mean()
+        level = information.sum(axis=0) + _RIDGE * len(scores) * np.eye(basis.shape[1])
+        crossed = np.einsum("d,dab->ab", centred, information)
+        remaining = remaining + np.einsum("d,dab->ab", centred**2, information) - crossed @ np.linalg.solve(level, crossed)
+        square += float(centred @ centred)
     # The basis is scaled: an average drive's information is one in each direction.
-    share, vectors = np.linalg.eigh(left / square)
+    share, vectors = np.linalg.eigh(remaining / square)
     return vectors[:, share >= _SLOPE]
 
 
-def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndarray, free: Sequence[np.ndarray]) -> Unit:
+def fit_unit(scores: Sequence[Score], directions: Directions, covariates: np.ndarray, free: Sequence[np.ndarray]) -> Unit:
     """One unit by least squares; ``covariates`` have shape (drives, m), the first of them 1.
 
-    Of each covariate only the directions in ``free`` are not zero, see `changing`. Directions about which its drives say
-    little are drawn to zero, with a hundredth of the information of an average drive. The covariance counts drives: it is made
-    of each drive's contribution to the equations at the solution (the sandwich of White, Econometrica 48, 1980).
+    Of each covariate only the directions in ``free`` are not zero, see `find_slope_directions`. A ridge of `_RIDGE` draws
+    directions to zero about which the drives contain little information. The covariance is that of drives, not of samples: the
+    sandwich estimator (White, Econometrica 48, 1980) over each drive's contribution to the equations at the solution.
     """
     from scipy.linalg import block_diag
 
@@ -118,18 +121,18 @@ def unit_of(scores: Sequence[Score], directions: Directions, covariates: np.ndar
     projected = np.array([basis.T @ score.products[:-1] for score in scores])
     information, right = projected[:, :, :-1] @ basis, projected[:, :, -1]
     normal = np.einsum("di,dj,dab->iajb", covariates, covariates, information).reshape(count * size, count * size)
-    held = _HELD * np.maximum(np.diag(covariates.T @ covariates), 1e-12)
+    ridge = _RIDGE * np.maximum(np.diag(covariates.T @ covariates), 1e-12)
     span = block_diag(*free)
-    inverse = span @ np.linalg.inv(span.T @ (normal + np.kron(np.diag(held), np.eye(size))) @ span) @ span.T
+    inverse = span @ np.linalg.inv(span.T @ (normal + np.kron(np.diag(ridge), np.eye(size))) @ span) @ span.T
     values = (inverse @ (covariates.T @ right).ravel()).reshape(count, size)
-    left = right - np.einsum("dab,db->da", information, covariates @ values)
-    moves = (np.einsum("di,da->dia", covariates, left).reshape(drives, -1) @ inverse.T).reshape(drives, count, size)
+    residual = right - np.einsum("dab,db->da", information, covariates @ values)
+    influence = (np.einsum("di,da->dia", covariates, residual).reshape(drives, -1) @ inverse.T).reshape(drives, count, size)
     freedom = max(drives - count, 1)
-    return Unit(values, np.einsum("dia,dib->iab", moves, moves) * drives / freedom, freedom)
+    return Unit(values, np.einsum("dia,dib->iab", influence, influence) * drives / freedom, freedom)
 
 
-def scatter_of(units: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scatter of ordinary units: robust mean (q,) and covariance (q, q) of most rows, (N, q), whatever the others are.
+def estimate_scatter(units: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Scatter of ordinary units: robust mean (q,) and covariance (q, q) of most rows, (N, q), independent of the others.
 
     Concentration steps of the minimum covariance determinant (Rousseeuw, Van Driessen, Technometrics 41, 1999) from medians,
     then once more with all rows that are not outliers. The covariance is drawn towards ``noise``, that of one row by its own
@@ -140,14 +143,14 @@ def scatter_of(units: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.nda
     covariance = np.diag(np.maximum(spread, 1e-9 * max(float(spread.max()), 1e-300)) ** 2)
     core = np.zeros(count, bool)
     for _ in range(_PASSES):
-        distance = _distances(units - mean, covariance)
+        distance = _squared_distances(units - mean, covariance)
         chosen = np.zeros(count, bool)
         chosen[np.argsort(distance, kind="stable")[: max(int(np.ceil(_CORE * count)), min(count, 3))]] = True
         if np.array_equal(chosen, core):
             break
         core = chosen
         mean, covariance = _moments(units[core], noise)
-    ordinary = _ordinary(_distances(units - mean, covariance), units) | core
+    ordinary = _is_ordinary(_squared_distances(units - mean, covariance), units) | core
     return _moments(units[ordinary], noise)
 
 
@@ -156,7 +159,7 @@ def _moments(rows: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return mean, ((rows - mean).T @ (rows - mean) + size * noise) / (max(count - 1, 1) + size)
 
 
-def _ordinary(distance: np.ndarray, units: np.ndarray) -> np.ndarray:
+def _is_ordinary(distance: np.ndarray, units: np.ndarray) -> np.ndarray:
     """Which squared distances belong to a normal population with their median, its covariance known from as many units."""
     from scipy.stats import f
 
@@ -164,7 +167,7 @@ def _ordinary(distance: np.ndarray, units: np.ndarray) -> np.ndarray:
     return distance / max(float(np.median(distance)), 1e-300) <= f.ppf(_OUTLYING, size, count) / f.median(size, count)
 
 
-def _distances(deviations: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _squared_distances(deviations: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", deviations @ np.linalg.inv(covariance), deviations)
 
 
@@ -174,37 +177,37 @@ class Readings:
     Args:
         units: shape (N, q).
         centre: centre of each unit's groups, shape (N, q); scatter is about it.
-        prints: of the causes, shape (K, q); a cause whose print is zero is never found.
+        signatures: of the causes, shape (K, q); a cause whose signature is zero is never found.
         noise: covariance of each unit by its own drives, shape (N, q, q).
         freedom: of each unit's noise, shape (N,).
 
     Attributes:
-        prints, freedom: as given.
+        signatures, freedom: as given.
         ordinary: units that are not outliers, shape (N,).
         filters: by unit and cause, weights that measure its vector, shape (N, K, q).
         inverse: of the scatter's covariance, mean over the parts, shape (q, q).
     """
 
-    def __init__(self, units: np.ndarray, centre: np.ndarray, prints: np.ndarray, noise: np.ndarray, freedom: np.ndarray):
+    def __init__(self, units: np.ndarray, centre: np.ndarray, signatures: np.ndarray, noise: np.ndarray, freedom: np.ndarray):
         # With few drives even the noise is not known in all directions: half of it is taken as independent.
         typical = noise.mean(axis=0)
         typical = 0.5 * (typical + np.diag(np.diag(typical)))
         fold = np.arange(len(units)) % min(_FOLDS, len(units))
-        apart = units - centre
-        others = [scatter_of(apart[fold != part], typical) for part in range(fold.max() + 1)]
+        centred = units - centre
+        others = [estimate_scatter(centred[fold != part], typical) for part in range(fold.max() + 1)]
         self._inverse = np.array([np.linalg.inv(covariance) for _, covariance in others])
         means = np.array([mean for mean, _ in others])
-        self.ordinary: np.ndarray = _ordinary(
-            np.einsum("ua,uab,ub->u", apart - means[fold], self._inverse[fold], apart - means[fold]), apart
+        self.ordinary: np.ndarray = _is_ordinary(
+            np.einsum("ua,uab,ub->u", centred - means[fold], self._inverse[fold], centred - means[fold]), centred
         )
-        along = np.einsum("fab,kb->fka", self._inverse, prints)
-        self.filters: np.ndarray = (along / np.maximum(np.einsum("fka,ka->fk", along, prints), 1e-300)[:, :, None])[fold]
-        self.prints: np.ndarray = prints
+        along = np.einsum("fab,kb->fka", self._inverse, signatures)
+        self.filters: np.ndarray = (along / np.maximum(np.einsum("fka,ka->fk", along, signatures), 1e-300)[:, :, None])[fold]
+        self.signatures: np.ndarray = signatures
         self._noise = noise
         self.freedom: np.ndarray = freedom
         self.inverse: np.ndarray = self._inverse.mean(axis=0)
 
-    def of(self, units: np.ndarray) -> np.ndarray:
+    def amounts(self, units: np.ndarray) -> np.ndarray:
         """Amount of each cause, shape (N, K)."""
         return np.einsum("uka,ua->uk", self.filters, units)
 
@@ -214,17 +217,17 @@ class Readings:
 
     def gain(self, total: np.ndarray) -> np.ndarray:
         """Fall of the squared distance that each cause explains of a vector, shape (K,)."""
-        size = np.einsum("ka,ab,kb->k", self.prints, self.inverse, self.prints)
-        return (self.prints @ self.inverse @ total) ** 2 / np.maximum(size, 1e-300)
+        size = np.einsum("ka,ab,kb->k", self.signatures, self.inverse, self.signatures)
+        return (self.signatures @ self.inverse @ total) ** 2 / np.maximum(size, 1e-300)
 
     def rivals(self, total: np.ndarray, cause: int) -> tuple[int, ...]:
-        """Causes that explain nearly as much of a vector as ``cause``, the best one, and beside it little of it: a cause that
-        explains as much of another part of the vector is no rival."""
+        """Causes that explain nearly as much of a vector as ``cause``, the best one, and that explain little of what ``cause``
+        leaves: a cause that explains another part of the vector is no rival."""
         gains = self.gain(total)
-        own = self.prints[cause]
-        amount = own @ self.inverse @ total / max(own @ self.inverse @ own, 1e-300)
-        beside = self.gain(total - amount * own)
-        close = (gains >= _RIVAL * gains[cause]) & (beside <= (1.0 - _RIVAL) * gains)
+        best = self.signatures[cause]
+        amount = best @ self.inverse @ total / max(best @ self.inverse @ best, 1e-300)
+        gains_left = self.gain(total - amount * best)
+        close = (gains >= _RIVAL * gains[cause]) & (gains_left <= (1.0 - _RIVAL) * gains)
         return tuple(int(row) for row in np.flatnonzero(close) if row != cause)
 
 
@@ -233,7 +236,7 @@ class Difference:
     """A cause that a group of units shares, or in which one unit differs from its group.
 
     Attributes:
-        where, cause: name of the group or row of the unit, and row of the prints.
+        where, cause: name of the group or row of the unit, and row of the signatures.
         amount, sigma: of the cause; of a unit ``sigma`` is the scatter between units.
         chance: of a group, that of no difference, corrected for all tested groups and causes (Holm, Scandinavian J. of
             Statistics 6, 1979): a batch is recalled because of a single finding, so that none may be false. Of a unit the
@@ -258,47 +261,48 @@ _SECOND = 0.1
 LEAST_UNITS = 3
 
 
-def shared_causes(
+def find_shared_causes(
     units: np.ndarray,
     groups: Mapping[str, np.ndarray],
     readings: Readings,
-    beside: bool,
+    against_others: bool,
     misfits: Collection[int] = (),
 ) -> list[Difference]:
     """Causes that groups of units share, one after the other, the strongest first, until none is significant.
 
     Args:
         groups: masks of the units, shape (N,).
-        beside: compare groups with all other units; otherwise with zero.
-        misfits: causes that are taken out of the units like others, but are no finding; nor is what cannot be told from one.
+        against_others: compare groups with all other units; otherwise with zero.
+        misfits: causes that are subtracted from the units like others, but are no finding; nor is one that has a misfit among
+            its rivals.
     """
-    rows, prints = readings.ordinary, readings.prints
+    rows, signatures = readings.ordinary, readings.signatures
     chosen: list[tuple[str, int]] = []
     found: list[Difference | None] = []
     first: dict[str, float] = {}
     amounts = np.zeros(0)
-    while len(chosen) < len(groups) * len(prints):
-        left = units - sum(
-            (np.outer(groups[g], prints[c]) * a for (g, c), a in zip(chosen, amounts, strict=True)), np.zeros_like(units)
+    while len(chosen) < len(groups) * len(signatures):
+        remaining = units - sum(
+            (np.outer(groups[g], signatures[c]) * a for (g, c), a in zip(chosen, amounts, strict=True)), np.zeros_like(units)
         )
         best: tuple[float, str, int] | None = None
         contrasts: dict[str, np.ndarray] = {}
         for group, members in groups.items():
-            inside, outside = left[members & rows], left[~members & rows]
-            if len(inside) < LEAST_UNITS or (beside and len(outside) < LEAST_UNITS):
+            inside, outside = remaining[members & rows], remaining[~members & rows]
+            if len(inside) < LEAST_UNITS or (against_others and len(outside) < LEAST_UNITS):
                 continue
-            contrast = inside.mean(axis=0) - (outside.mean(axis=0) if beside else 0.0)
-            weight = 1.0 / (1.0 / len(inside) + (1.0 / len(outside) if beside else 0.0))
+            contrast = inside.mean(axis=0) - (outside.mean(axis=0) if against_others else 0.0)
+            weight = 1.0 / (1.0 / len(inside) + (1.0 / len(outside) if against_others else 0.0))
             gains, contrasts[group] = weight * readings.gain(contrast), contrast
             if best is None or gains.max() > best[0]:
                 best = float(gains.max()), group, int(gains.argmax())
         if best is None:
             break
         gain, group, cause = best
-        amount = readings.of(left)[:, cause]
+        amount = readings.amounts(remaining)[:, cause]
         inside, outside = amount[groups[group] & rows], amount[~groups[group] & rows]
-        p_value, value, sigma = _compare(inside, outside if beside else None)
-        chance = min(1.0, p_value * (len(contrasts) * len(prints) - len(chosen)))
+        p_value, value, sigma = _compare(inside, outside if against_others else None)
+        chance = min(1.0, p_value * (len(contrasts) * len(signatures) - len(chosen)))
         if chance > SURE:
             break
         rivals = readings.rivals(contrasts[group], cause)
@@ -306,7 +310,7 @@ def shared_causes(
         mismatch = gain < _SECOND * first.setdefault(group, gain)
         misfit = not {cause, *rivals}.isdisjoint(misfits)
         found.append(None if mismatch or misfit else Difference(group, cause, value, sigma, chance, rivals))
-        amounts = _together(units[rows], [(groups[g][rows], prints[c]) for g, c in chosen], readings, beside)
+        amounts = _fit_together(units[rows], [(groups[g][rows], signatures[c]) for g, c in chosen], readings, against_others)
     return [replace(one, amount=float(amount)) for one, amount in zip(found, amounts, strict=True) if one]
 
 
@@ -320,28 +324,28 @@ def _compare(inside: np.ndarray, outside: np.ndarray | None) -> tuple[float, flo
     return float(test.pvalue), float(value), float(np.sqrt(sum(one.var(ddof=1) / len(one) for one in sets)))
 
 
-def _together(
-    units: np.ndarray, chosen: Sequence[tuple[np.ndarray, np.ndarray]], readings: Readings, beside: bool
+def _fit_together(
+    units: np.ndarray, chosen: Sequence[tuple[np.ndarray, np.ndarray]], readings: Readings, against_others: bool
 ) -> np.ndarray:
     """Amounts of all chosen causes by generalised least squares, the population's mean free if groups are compared."""
     masks = np.array([members for members, _ in chosen], float)
-    prints = np.array([own for _, own in chosen])
-    if beside:
+    signatures = np.array([signature for _, signature in chosen])
+    if against_others:
         masks, units = masks - masks.mean(axis=1, keepdims=True), units - units.mean(axis=0)
     inverse = readings.inverse
-    normal = (masks @ masks.T) * (prints @ inverse @ prints.T)
-    right = np.einsum("gu,ga,ab,ub->g", masks, prints, inverse, units)
+    normal = (masks @ masks.T) * (signatures @ inverse @ signatures.T)
+    right = np.einsum("gu,ga,ab,ub->g", masks, signatures, inverse, units)
     return np.linalg.lstsq(normal, right, rcond=1e-10)[0]
 
 
-def outliers(deviations: np.ndarray, readings: Readings) -> list[Difference]:
+def find_outliers(deviations: np.ndarray, readings: Readings) -> list[Difference]:
     """Units that differ from their group, shape (N, q) about its centre, largest difference first. The difference must exceed
-    both the scatter between units and that between the unit's own drives, each as well as it is known: ten drives tell a
-    scatter to a quarter, and of many units one has it from drives that happen to agree."""
+    both the scatter between units and that between the unit's own drives, each with its degrees of freedom: ten drives
+    determine a scatter to a quarter, and among many units there is one whose drives happen to agree."""
     from scipy.stats import false_discovery_control
     from scipy.stats import t as student
 
-    amounts, rows = readings.of(deviations), readings.ordinary
+    amounts, rows = readings.amounts(deviations), readings.ordinary
     freedom = max(int(rows.sum()) - 1, 1)
     spread, noise = np.sqrt((amounts[rows] ** 2).sum(axis=0) / freedom), readings.noise()
     between = student.sf(np.abs(amounts) / np.maximum(spread, 1e-300), freedom)
@@ -359,15 +363,15 @@ def outliers(deviations: np.ndarray, readings: Readings) -> list[Difference]:
     return sorted(found, key=lambda one: (one.chance, -abs(one.amount / one.sigma)))
 
 
-def centres(units: np.ndarray, factors: Mapping[str, np.ndarray]) -> np.ndarray:
+def find_centres(units: np.ndarray, factors: Mapping[str, np.ndarray]) -> np.ndarray:
     """Centre of each unit's groups, shape (N, q): medians by level, one factor after the other."""
-    left = units - np.median(units, axis=0)
+    remaining = units - np.median(units, axis=0)
     for levels in factors.values():
         for level in np.unique(levels):
             mine = levels == level
             if mine.sum() >= LEAST_UNITS:
-                left[mine] -= np.median(left[mine], axis=0)
-    return units - left
+                remaining[mine] -= np.median(remaining[mine], axis=0)
+    return units - remaining
 
 
 @dataclass(frozen=True)
@@ -377,14 +381,16 @@ class RandomEffects:
     Attributes:
         mean, sigma: of the population, and the mean's standard deviation.
         spread: standard deviation between units, without noise.
+        units: number of units.
     """
 
     mean: float
     sigma: float
     spread: float
+    units: int
 
 
-def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
+def estimate_random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
     """Mean and spread of units whose values, shape (N,), have standard deviations of their own, by Paule and Mandel (J.
     Research NBS 87, 1982)."""
     from scipy.optimize import brentq
@@ -398,4 +404,4 @@ def random_effects(values: np.ndarray, sigmas: np.ndarray) -> RandomEffects:
     spread_2 = brentq(excess, 1e-9, 10.0) * variance if len(values) > 1 and excess(1e-9) > 0.0 > excess(10.0) else 0.0
     weight = 1.0 / np.maximum(sigmas**2 + spread_2, 1e-300)
     mean = float(weight @ values / weight.sum())
-    return RandomEffects(mean, float(weight.sum() ** -0.5), float(np.sqrt(spread_2)))
+    return RandomEffects(mean, float(weight.sum() ** -0.5), float(np.sqrt(spread_2)), len(values))

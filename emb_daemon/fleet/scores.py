@@ -89,7 +89,7 @@ class _Bench(Bench):
         self._contact, self._made = contact, made
 
     def _trial(self, index: int, log: Log, mounted: Mapping[str, float]) -> Trial:
-        """Not cut into episodes, for which the whole step would be run once more: a drive is one opinion."""
+        """Not cut into episodes, for which the whole step would be run once more: a drive counts as one episode."""
         nothing, never = np.zeros(0), np.zeros(len(log.samples), np.bool_)
         return Trial(log, index, log.force_N, nothing, nothing, nothing, nothing, nothing, nothing, never, mounted)
 

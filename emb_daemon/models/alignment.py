@@ -1,18 +1,19 @@
-"""Time by which the current is late, or early, beside the motion that it causes, and filters that either went through.
+"""Delay or lead of the current relative to the motion that it causes, and filters of either signal.
 
-Angle and current travel in two messages. A gateway, or another sampling instant, moves one against the other by some cycles;
-another converter or tracking loop filters one of them. Where the torque changes, the balance of torques then fails by
-kilonewtons, which pass for another contact, stiffness or friction. While the pads are apart, inertia and friction alone need a
-torque. Its changes are compared with the current's: at several shifts in whole cycles, where the least sum of squares and its
-two neighbours give a shift (Knapp and Carter, The generalized correlation method for estimation of time delay, IEEE Trans.
-Acoustics, Speech and Signal Processing 24(4), 1976); with what a first-order filter has taken from the current, by linear
-regression; and with the current through several filters, because the motion may have gone through one. What explains most is
-undone: the earlier signal is delayed, or filtered, as the other is, and a filtered current is what went into its filter.
+Angle and current come in two messages. A gateway, or another sampling instant, delays one by some cycles relative to the
+other; another converter or tracking loop filters one of them. Wherever the torque changes, the torque balance is then wrong by
+kilonewtons, which looks like another contact, stiffness or friction. While the pads are apart, the motor torque is that of
+inertia and friction alone. Its changes are compared with those of the current in three ways: at several shifts in whole
+cycles, where the least sum of squares and its two neighbours give a shift (Knapp and Carter, The generalized correlation
+method for estimation of time delay, IEEE Trans. Acoustics, Speech and Signal Processing 24(4), 1976); with the change that a
+first-order filter makes in the current, by linear regression; and with the current through several filters, because the motion
+may have been filtered. The hypothesis that explains most is undone: the earlier signal is delayed or filtered like the other
+one, and a filtered current is replaced by the input of its filter.
 
 Of 24 phases with a current that is up to 12 ms late 14 fail without this and none with it, of 29 with a resolver that is one
 or two cycles late 13 and 2 (`studies.silent grid --faults current_delayed,resolver_delayed --count 8 --seed 5`). Of 53 with
-filtered currents and angles 26 fail where only shifts are undone, 16 with filters, and 8 where what was learned meanwhile is
-given up, too (`estimator.rewind`; `--faults current_filtered,angle_filtered --count 8 --seed 63`).
+filtered currents and angles 26 fail where only shifts are undone, 16 with filters, and 8 if what the filter learned in
+between is discarded as well (`estimator.rewind`; `--faults current_filtered,angle_filtered --count 8 --seed 63`).
 """
 
 from math import exp, log
@@ -25,33 +26,34 @@ from emb_daemon.wire.contract import CYCLE_S
 #: Cycles by which a current may be early or late: sample, frame and gateway each a cycle.
 EARLIEST, LATEST = 3, 4
 _SHIFTS = EARLIEST + LATEST + 1
-#: Longest time constant of a filter that is undone, cycles: the noise of a current grows by some times as much. Time constants
-#: of those that the current is compared through with the motion, an octave from each other.
+#: Longest time constant of a filter that is undone, cycles: undoing it multiplies white noise of a current by about one and a
+#: half times this number.
+#: Time constants of the filters through which the current is compared with the motion, an octave apart.
 SLOWEST, _FILTERS = 12.0, (1.0, 2.0, 4.0, 8.0)
-#: Change of the needed torque that tells shifts apart, in standard deviations of a torque; way within the samples that are
-#: kept which noise of angle or speed does not make, rad. Without a fault one cycle then makes some twenty times the sum of
-#: squares.
+#: Conditions for a comparison: least range of the torque by motion, in standard deviations of a torque, and least range of the
+#: angle within the stored samples, rad, which noise does not reach. A shift of one cycle then multiplies the sum of squares by
+#: about twenty.
 _CLEAR, _MOVED_RAD = 6.0, 0.05
-#: Samples that tell, over which the sums forget: a few strokes, because what changes while driving is to be found against what
-#: was seen before. Of 34 phases with a filtered current (`studies.silent grid --faults current_filtered --count 10 --seed 61`)
-#: 11 fail with 100. Fewest of them that are enough: one stroke has as many.
+#: Informative samples over which the leaky sums forget: a few strokes, so that a change while driving is found in spite of
+#: earlier samples. Of 34 phases with a filtered current (`studies.silent grid --faults current_filtered --count 10 --seed 61`)
+#: 11 fail with 100. Least number of informative samples for a decision: one stroke has as many.
 _KEPT, _ENOUGH = 20.0, 6.0
-#: Least shift that is taken out, and least time constant, cycles. Half of one is within what the estimate allows for, and
-#: interpolation costs as much; a current that is late by a third looks like a filter of as much.
+#: Least shift and least time constant that are undone, cycles. Half a cycle is within the estimate's tolerance, and
+#: interpolation costs as much; a current that is late by a third of a cycle looks like a filter of that time constant.
 _WORTH, _WORTH_SLOW = 0.6, 0.5
 #: RMS difference between the changes of both torques, in standard deviations of one torque, from which a shift or a filter is
-#: looked for. The difference of two changes has 1.4 by noise alone. For a shift it must be three times that, because some
-#: shift always explains much of noise; for a filter, which explains little of noise, somewhat more than 1.4. The shortest
-#: filter that is undone makes 2 where changes are just large enough to be compared.
+#: searched for. By noise alone it is 1.4. For a shift it must be three times as large, because some shift always explains
+#: much of the noise; for a filter, which explains little of it, somewhat more than 1.4. The shortest filter that is undone
+#: makes 2 if changes are just large enough to be compared.
 _BEYOND, _BEYOND_SLOW = 4.2, 1.75
-#: Least part of the sum of squares that a shift, or a filter of the current, must explain: a right one leaves a twentieth to
-#: a fifth, and friction that the calibration does not know, as of grease at -20 degC, has made a wrong one explain half. The
-#: same of a filter of the motion: a current that shows twice as much looks like one, and two thirds of it are explained.
+#: Least share of the sum of squares that a shift, or a filter of the current, must explain: a correct one leaves a twentieth
+#: to a fifth; with friction unknown to the calibration, such as grease at -20 degC, a wrong one has explained half. The same
+#: for a filter of the motion: a current sensor with twice the gain looks like such a filter, which explains two thirds.
 _EXPLAINS, _EXPLAINS_MOTION = 0.6, 0.8
-#: Cycles for which a change of torque still counts in averaged torques (`models.contact`).
+#: Cycles for which a change of torque remains in averaged torques (`models.contact`).
 _SETTLED = 16.0
-#: Samples that are kept, one more than the largest shift. A motor stands that moved by less than three counts of a resolver of
-#: 12 bit meanwhile, rad.
+#: Stored samples, one more than the largest shift. Range of the angle over these samples below which the motor counts as
+#: standing, rad: three counts of a 12-bit resolver.
 _KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 
 #: Torques by the last cycles, N m, the newest first: ``by_current``, ``by_motion``, which inertia and friction need, and the
@@ -59,11 +61,12 @@ _KEPT_SAMPLES, _STANDS_RAD = LATEST + 2, 0.005
 #: ``motion_square``), of their difference at each shift (``shift_square``) and with each filter (``low_pass_square``), of
 #: noise (``noise_square``), of second differences by the current (``curvature_square``), and of their product with the
 #: difference of both changes (``curvature_product``). ``consecutive`` cycles without a gap; ``informative`` ones, in which the
-#: torque by motion changed enough, leaky; ``unsettled``: cycles until the last of those counts no more. Found, not yet undone:
-#: ``delay_left`` cycles by which the current is behind, negative if the motion is, and ``lag_left`` cycles of a filter of the
-#: current, negative of the motion. Undone: ``delay`` and ``lag``, likewise. ``filtered`` A: the last current, as it came or,
-#: if the motion is filtered, through that filter. ``low_pass`` N m: torque by the current less friction through each filter,
-#: and its change in this cycle (``low_pass_change``). The last samples: ``age`` s, ``angle``, ``speed``, ``current``.
+#: torque by motion changed enough, leaky; ``unsettled``: cycles until the last of those has no effect. Found, not yet undone:
+#: ``delay_left``, delay of the current in cycles, negative for a delay of the motion, and ``lag_left``, time constant of a
+#: filter of the current in cycles, negative for one of the motion. Undone: ``delay`` and ``lag``, with the same signs.
+#: ``filtered`` A: the last current as received or, if the motion is filtered, through that filter. ``low_pass`` N m: torque by
+#: the current less friction through each filter, and its change in this cycle (``low_pass_change``). The last samples: ``age``
+#: s, ``angle``, ``speed``, ``current``.
 ALIGNMENT = np.dtype(
     [
         *((name, "f8", (_SHIFTS + 1,)) for name in ("by_current", "by_motion", "friction")),
@@ -79,8 +82,8 @@ ALIGNMENT = np.dtype(
 
 @njit
 def align(a: Record, m: Record) -> bool:
-    """Replace motion or current of SAMPLE ``m``, whichever is early, by what belongs to the other, and a filtered current by
-    what went into its filter. Returns whether they are apart by something else from now on."""
+    """Replace the motion or the current of SAMPLE ``m``, whichever is early, by its value at the time of the other, and a
+    filtered current by the input of its filter. Returns whether the correction has just changed."""
     _keep(a, m)
     a.unsettled = max(a.unsettled - 1.0, 0.0)
     found = out_of_step(a) and _range(a.angle) < _STANDS_RAD
@@ -109,7 +112,7 @@ def _filter(a, m):
 
 @njit
 def out_of_step(a: Record) -> bool:
-    """Whether current and motion were found to be apart, which is not yet undone."""
+    """Whether a delay or a filter was found that is not yet undone."""
     return a.delay_left != 0.0 or a.lag_left != 0.0
 
 
@@ -134,7 +137,7 @@ def _range(values):
 
 @njit
 def _at(ages, values, age):
-    """Value of ``age`` s ago, between samples."""
+    """Value ``age`` s ago, linear between samples."""
     i = 1
     while i < len(ages) - 1 and ages[i] < age:
         i += 1
@@ -146,8 +149,8 @@ def _at(ages, values, age):
 def compare(a: Record, by_current: float, by_motion: float, friction: float, noise: float) -> None:
     """Take one cycle's torque by the current and by the motion, and the friction of the latter, N m, while the pads are apart.
 
-    ``noise`` N m: standard deviation of their difference, by the noise of the speed and by the part of a cycle of delay that
-    the estimate allows for."""
+    ``noise`` N m: standard deviation of their difference, by the noise of the speed and by the tolerated fraction of a cycle
+    of delay."""
     for i in range(_SHIFTS, 0, -1):
         a.by_current[i], a.by_motion[i], a.friction[i] = a.by_current[i - 1], a.by_motion[i - 1], a.friction[i - 1]
     a.by_current[0], a.by_motion[0], a.friction[0] = by_current, by_motion, friction
@@ -197,7 +200,7 @@ def _found(a):
     apart = a.shift_square[EARLIEST]
     if a.informative < _ENOUGH or apart < _BEYOND_SLOW * _BEYOND_SLOW * a.noise_square:
         return 0.0, 0.0
-    # A shift or filter must explain more than no torque at all would: a dead current is neither late nor filtered.
+    # A shift or filter must explain more than zero current would: a dead current sensor is neither late nor filtered.
     place, least = _least(a.shift_square)
     left, shift, slow = least / min(apart, a.current_square), place - EARLIEST, 0.0
     if a.curvature_product > 0.0:
@@ -251,12 +254,12 @@ def _forget(a):
 
 @njit
 def at_bound(a: Record) -> bool:
-    """Whether current and motion may be further apart than is taken out."""
+    """Whether the delay or filter may be larger than can be undone."""
     return a.delay in (-EARLIEST, LATEST) or abs(a.lag) == SLOWEST
 
 
 @njit
 def aligned(a: Record) -> bool:
-    """Whether the present torque may be used before the contact angle is known: torques have not changed of late, or their
-    changes were found to belong together."""
+    """Whether the present torque may be used before the contact angle is known: either no recent change of torque is in it, or
+    the changes of both torques were found to coincide."""
     return not out_of_step(a) and (a.informative >= _ENOUGH or a.unsettled == 0.0)

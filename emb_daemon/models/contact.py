@@ -1,10 +1,10 @@
-"""Contact of pads and disc: when the brake engages, and when what was believed of the contact angle cannot be true.
+"""Contact of pads and disc: when the brake engages, and when the estimated contact angle cannot be right.
 
 Thesis 2.5 signals contact when lambda = dT_m/dtheta exceeds a threshold. A difference of torques at 4 ms is mostly noise, so
 lambda is used in its integrated form: the rise of the torque over its level in the clearance, summed one-sidedly (Page,
 "Continuous inspection schemes", Biometrika 41, 1954). The level is learned in each clearance, so that an offset of current or
-friction raises no alarm. At speed the torque says nothing within a few radians; there contact is signalled as soon as the
-motor has passed the tracked contact angle by several of its standard deviations.
+friction raises no alarm. At speed the torque cannot show contact within a few radians; there contact is signalled as soon as
+the motor has passed the tracked contact angle by several of its standard deviations.
 """
 
 from math import exp, log, sqrt
@@ -13,9 +13,9 @@ import numpy as np
 
 from emb_daemon.jit import Record, fields, njit, sq
 
-#: ``rise``, ``shortfall``: summed torque above and below what clearance level and believed force need, in standard deviations
-#: of one sample. ``level``: torque in the clearance, N m, known as well as the mean of ``samples``. ``early``: torque above
-#: that, N m, mean of the first ``begun`` samples of this stroke. ``excess``: the same, smoothed over the last ``watched``
+#: ``rise``, ``shortfall``: summed torque above and below that of clearance level and estimated force, in standard deviations
+#: of one sample. ``level``: torque in the clearance, N m, mean of ``samples``. ``early``: torque above the level, N m, mean of
+#: the first ``begun`` samples of this stroke. ``excess``: the same, smoothed over the last ``watched``
 #: samples. ``agreed``: number of closing samples that confirm the contact angle.
 CONTACT = np.dtype(
     [
@@ -27,7 +27,7 @@ CONTACT = np.dtype(
     align=True,
 )
 
-#: What a watch found: nothing, force where clearance was believed, or clearance where force was believed.
+#: Result of `watch_closing`: no contradiction; force where clearance was assumed; clearance where force was assumed.
 NOTHING, TOO_LATE, TOO_EARLY = range(3)
 
 #: Torque (standard deviations of one sample) that is subtracted from a sum with each sample, and logarithm of the mean number
@@ -44,11 +44,11 @@ _SMOOTHED, _CONFIRMING = 15.0, 100
 #: Error of curve and friction, as a share of the force, that is not attributed to the contact angle; torque (standard
 #: deviations of one sample) above which agreement confirms it.
 _TOLERANCE, _TELLING = 0.07, 3.0
-#: Number of clearance samples whose mean replaces the believed offset, and factor by which correlated noise enlarges the
+#: Number of clearance samples whose mean replaces the filter's offset, and factor by which correlated noise enlarges the
 #: standard deviation of that mean.
 _SHOWN, _CORRELATED = 20.0, 1.5
-#: An offset is there from the first sample of a stroke, a force grows. Number of first samples that are averaged to tell them
-#: apart, least number, and share of the excess that an offset must have shown in them.
+#: An offset is present from the first sample of a stroke; a force grows. To distinguish them: number of first samples that are
+#: averaged, least number, and share of the excess that must have been present in them if it is an offset.
 _BEGINNING, _BEGUN, _AT_ONCE = 8.0, 3.0, 0.5
 #: Standard deviations of the contact angle beyond which it counts as passed.
 _CERTAIN = 4.0
@@ -65,7 +65,7 @@ def threshold(current_share: float, correlation_time: float, dt: float) -> float
 
 @njit
 def engaged(state: Record, x: float, contact_sigma: float) -> bool:
-    """Whether the pads touch, ``x`` rad past the contact angle of standard deviation ``contact_sigma``; the last answer while
+    """Whether the pads touch, ``x`` rad past the contact angle of standard deviation ``contact_sigma``; unchanged while
     neither is certain."""
     if x > _CERTAIN * contact_sigma:
         state.engaged = True
@@ -79,21 +79,21 @@ def watch_closing(
     state: Record, torque: float, predicted: float, friction_mean: float, sigma: float, limit: float, x: float,
     contact_sigma: float, offset: float, offset_sigma: float, turns: bool,
 ) -> int:  # fmt: skip
-    """Compare torque with belief for one sample.
+    """Compare the torque of one sample with that of the estimated force.
 
     Args:
         state: CONTACT record.
-        torque: motor torque left to the clamp force, N m; NaN if it says nothing.
-        predicted: what the believed clamp force needs of it, N m.
+        torque: motor torque left to the clamp force, N m; NaN if it cannot be used.
+        predicted: torque of the estimated clamp force, N m.
         friction_mean: friction state over the cycle; near +1 while closing.
         sigma: standard deviation of ``torque``, N m.
         limit: `threshold`.
-        x, contact_sigma: rad past the believed contact angle, and its standard deviation.
+        x, contact_sigma: rad past the estimated contact angle, and its standard deviation.
         offset, offset_sigma: the filter's offset of ``torque``, N m; used until enough clearance samples have shown it.
-        turns: whether the motor turns. Without that no force arises in the clearance, but an offset.
+        turns: whether the motor turns. If it does not, a torque in the clearance is an offset.
 
     Returns:
-        NOTHING, TOO_LATE or TOO_EARLY: how the believed contact angle is wrong.
+        NOTHING, TOO_LATE or TOO_EARLY: in which direction the estimated contact angle is wrong.
     """
     if not np.isfinite(torque):
         return NOTHING
@@ -137,7 +137,7 @@ def watch_closing(
 @njit
 def clearance_level(state: Record, sigma: float, offset: float, offset_sigma: float) -> tuple[float, float]:
     """Torque in the clearance and its standard deviation, N m: the mean of the clearance's samples, each of standard deviation
-    ``sigma``, once there are enough; before that what the filter believes."""
+    ``sigma``, once there are enough; before that the filter's offset."""
     if state.samples < _SHOWN:
         return offset, offset_sigma
     return state.level, max(_CORRELATED * sigma / sqrt(state.samples), offset_sigma)
@@ -158,7 +158,7 @@ def forget_level(state: Record) -> None:
 
 @njit
 def start_anew(state: Record) -> None:
-    """Forget all sums, because the believed contact angle has changed."""
+    """Forget all sums, because the estimated contact angle has changed."""
     state.lost, state.confirmed, state.agreed = True, False, 0
     state.rise = state.shortfall = state.excess = state.watched = 0.0
 

@@ -24,8 +24,8 @@ for noise, which takes slow model error for white noise. Here the filter estimat
                                           - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA + NOISE + OFFSET
                                           + white noise,  D = gamma + mu s
 
-H_i is the force that the pads were held with of late. Slow errors stay correlated in time, and the standard deviation is that
-of the force.
+H_i is the static force of the pads through a first-order lag. Slow errors stay correlated in time, and the standard
+deviation is that of the force.
 """
 
 from math import sqrt

@@ -1,11 +1,12 @@
 """Age of the resolver's angle relative to the speed that comes with it, or of the speed, and error of the resolver's gain.
 
-An angle that is late lags the integrated speed by age times speed; one of wrong gain, by a share of the way. Both are followed
-over a tenth of a second and fitted together, because otherwise a gain error of seven hundredths looks like an age. Neither
-signal can be ahead of the motor: where the angle leads, the speed went through a filter, as tracking loops and firmware have
-them, and inertia would seem to need kilonewtons at the wrong time. What went into the filter takes the speed's place.
+A late angle lags the integrated speed by its age times the speed; an angle of wrong gain lags it by a share of the travel.
+Both are followed over a tenth of a second and fitted together, because otherwise a gain error of seven hundredths looks like
+an age. Neither signal can be ahead of the motor. If the angle leads, the speed was filtered, for example by a tracking loop or
+by firmware; the torque of the inertia would then be wrong by kilonewtons of clamp force. The input of that filter is
+reconstructed and replaces the speed.
 
-The speed of a motor that is at rest is an offset, and is taken off: added up it would pass for a zero that wanders.
+The speed of a motor at rest is an offset, and is subtracted; integrated, it would look like a drifting zero of the resolver.
 """
 
 from math import copysign, exp, sqrt
@@ -39,7 +40,7 @@ _BEYOND_RAD = 0.1
 #: was at calibration; through more than twelve cycles a stroke is not seen.
 _WORTH_S, SLOWEST_S = 0.5 * CYCLE_S, 12.0 * CYCLE_S
 #: Standard deviation of an age up to which a filter is sought, s, and as a share of the age: at the beginning of a stroke a
-#: late speed looks like one through any filter. Chosen on our own plant: without it a speed two cycles late passed for a
+#: late speed looks like one through any filter. Chosen on our own plant: without it a speed two cycles late was taken for a
 #: filter of twelve, and without the share a filter of 25 ms was found a stroke too late.
 _CLEAR_S, _CLEAR = 2.5e-4, 0.04
 #: Samples of a motor that stands over which its speed is averaged, standard deviations of that mean from which it is an
@@ -55,9 +56,9 @@ _SS, _SW, _WW, _AS, _AW, _SUMS = 0, 1, 2, 3, 4, 5
 
 #: ``apart``, ``gained`` and ``gone``: angle less integrated speed (rad), speed (rad/s) and way (rad), leaky. ``sums`` of some
 #: stops, and ``recent`` ones; ``age`` s, and ``gain``, the gain error if it is certain, or 0. ``ahead`` s: by which the angle
-#: leads the speed of late, or lags it if negative, if that is certain, or 0. ``filtered`` s: time constant of the speed's
-#: filter, which is undone; ``reported`` rad/s: the last speed as it came. ``offset`` rad/s of it, which is taken off, a
-#: mean of ``known`` samples, and what a standing motor shows beside: ``standing`` rad/s, the sum over ``stood`` samples.
+#: leads the speed by the recent sums, or lags it if negative, if that is certain, or 0. ``filtered`` s: time constant of the
+#: speed's filter, which is undone; ``reported`` rad/s: the last speed as it came. ``offset`` rad/s of it, which is taken off,
+#: a mean of ``known`` samples, and the rest that a standing motor shows: ``standing`` rad/s, the sum over ``stood`` samples.
 #: ``interrupted``: the last sample was not followed.
 LATENESS = np.dtype(
     [
@@ -191,7 +192,7 @@ def follow(a: Record, travel: float, turned: float, gained: float, noise: float,
     """Take one sample: ``travel`` rad by the angle, ``turned`` rad and ``gained`` rad/s by the speed, in ``dt`` s; ``noise``
     rad/s of the speed."""
     if a.interrupted:
-        # After a gap the angle has gone further than the last speeds say.
+        # After a gap the angle has moved further than the last speeds account for.
         a.interrupted = False
         return
     keep = exp(-dt / _FOLLOWED_S)

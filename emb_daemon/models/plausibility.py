@@ -19,7 +19,7 @@ import numpy as np
 from emb_daemon.jit import Record, fields, hypot, njit
 
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
-#: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the speed says.
+#: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the integrated speed.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``steady``: the same less what
@@ -61,8 +61,8 @@ _REPEATED, _NEVER_REPEATED = 8, 50
 #: times in a row: with one repetition in five by chance, once in 1e8.
 _FLICKERED, _FROZEN = 50, 12
 #: Time constant over which angle and integrated speed are compared (s), and difference (rad) that is a fault, in addition to
-#: what a signal delay of `_DELAY_S` causes. A resolver is believed again after `_RETURNED` samples in which the angle moved
-#: and followed the speed within `_ALIKE_RAD`.
+#: what a signal delay of `_DELAY_S` causes. A resolver is used again after `_RETURNED` samples in which the angle moved and
+#: followed the speed within `_ALIKE_RAD`.
 _COMPARED_S, _APART_RAD, _DELAY_S = 0.1, 0.6, 0.01
 _RETURNED, _ALIKE_RAD = 25, 0.05
 #: Share by which friction at rest may exceed what sliding takes.
@@ -98,26 +98,15 @@ def watch(
         c: PLAUSIBILITY record.
         m: SAMPLE record.
         angle_before, speed_before: rad and rad/s of the last sample; turned: rad since then by the speed.
-        past_contact, contact_sigma: rad past the believed contact angle, and its standard deviation.
-        confirmed: whether the contact angle has been seen to be right. Until then `models.contact` has the first word.
+        past_contact, contact_sigma: rad past the estimated contact angle, and its standard deviation.
+        confirmed: whether the contact angle is confirmed. Until then `models.contact` decides first.
 
     Returns:
         The verdict, also kept in ``c.verdict``.
     """
     travel = m.angle - angle_before
-    step = travel - turned
     delay = _DELAY_S * abs(m.speed)
-    c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
-    if abs(step) > _ALIKE_RAD + delay:
-        c.alike = 0
-    elif abs(travel) > _STANDS_RAD:
-        c.alike += 1
-    c.still = c.still + 1 if travel == 0.0 and m.speed == speed_before else 0
-    if m.has_current:
-        c.idle = c.idle + 1 if m.current_q == c.current else 0
-        c.current_flickered += c.idle == 0
-        c.current = m.current_q
-        _look_for_limit(c, m.current_q, travel)
+    _count_repetitions(c, m, travel, travel - turned, delay, speed_before)
     was = c.verdict
     if was == STIFFNESS_WRONG:
         c.frozen_s += m.dt
@@ -151,6 +140,23 @@ def watch(
 
 
 @njit
+def _count_repetitions(c, m, travel, step, delay, speed_before):
+    """Update what is known of each sensor alone: how long it repeats its value, and whether angle and speed agree. ``travel``
+    rad of the angle, ``step`` rad beyond the integrated speed, ``delay`` rad that a late angle explains."""
+    c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
+    if abs(step) > _ALIKE_RAD + delay:
+        c.alike = 0
+    elif abs(travel) > _STANDS_RAD:
+        c.alike += 1
+    c.still = c.still + 1 if travel == 0.0 and m.speed == speed_before else 0
+    if m.has_current:
+        c.idle = c.idle + 1 if m.current_q == c.current else 0
+        c.current_flickered += c.idle == 0
+        c.current = m.current_q
+        _look_for_limit(c, m.current_q, travel)
+
+
+@njit
 def _look_for_limit(c, current, travel):
     """Learn the current (A) beyond which the sensor does not measure: one that repeats to the bit while the motor turns. A
     limit that a later ``current`` exceeds is forgotten, and the sensor is coarse."""
@@ -166,7 +172,7 @@ def _look_for_limit(c, current, travel):
 
 @njit
 def frozen(c: Record) -> bool:
-    """Whether one sensor repeats its value while the other changes: then their difference says nothing about the contact
+    """Whether one sensor repeats its value while the other changes: then their difference is no evidence about the contact
     angle."""
     return c.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN) or (c.still > 0) != (c.idle > 0) or c.still < _REPEATED <= c.idle
 
@@ -235,7 +241,7 @@ def due(c: Record, acceleration: float, delay: float, dt: float) -> bool:
     lasting = min(acceleration, c.due_acceleration)
     c.due_acceleration = acceleration
     if c.held < 2:
-        # A motor that arrives and turns back within a sample is again where it was, whatever the acceleration.
+        # A motor that arrives and turns back within a sample is where it was before, at any acceleration.
         return False
     c.due_speed = c.due_speed + lasting * dt if lasting > 0.0 else 0.0
     c.due_angle += c.due_speed * dt
@@ -251,7 +257,7 @@ def believe_resolver(c: Record) -> None:
 
 @njit
 def disbelieve_resolver(c: Record) -> None:
-    """Do not use the resolver until its angle again moves as the speed says."""
+    """Do not use the resolver until its angle again follows the speed."""
     if c.verdict != STIFFNESS_WRONG:
         c.verdict, c.alike, c.frozen_s = STIFFNESS_WRONG, 0, _AVERAGED_S
 
@@ -276,7 +282,7 @@ def force_of_torque_alone(
     c: Record, torque: float, has_current: bool, dt: float, gear_gain: float, load_friction: float, offset_friction: float,
     spring: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Clamp force (N) and its standard deviation from motor torque without a resolver, beside the ``spring`` force in N.
+    """Clamp force (N) and its standard deviation from motor torque without a resolver, less the ``spring`` force in N.
 
     The direction of friction and the motor's acceleration are unknown: friction counts in full, and inertia as the torque's
     variation over `_AVERAGED_S`. Must be called with every sample, because it keeps that variation up to date.

@@ -29,7 +29,7 @@ def characteristic_curve(x: float, coefficients: Floats) -> tuple[float, float]:
 
 @njit
 def mean_slope(x: float, spread: float, coefficients: Floats) -> float:
-    """Slope (N/rad) of the curve between ``spread`` rad below and above ``x``: what the force tells of an uncertain contact
+    """Slope (N/rad) of the curve between ``spread`` rad below and above ``x``: how the force depends on an uncertain contact
     angle (statistical linearisation; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 5). Not zero just before contact."""
     above, _ = characteristic_curve(x + spread, coefficients)
     below, _ = characteristic_curve(x - spread, coefficients)

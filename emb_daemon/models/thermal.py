@@ -29,7 +29,7 @@ LONGEST_S = 0.25
 
 
 class Altered(NamedTuple):
-    """How effects alter the heat balance: factors, and heat (W) that flows beside it.
+    """How effects alter the heat balance: factors, and additional heat (W).
 
     Attributes:
         heat_share: on the share of the friction power that goes into the pads; the disc gets the rest.
@@ -246,7 +246,7 @@ def stiffness_factor(p: Record, rise: float, history: float) -> float:
     """alpha: stiffness over that of the cold pads (thesis 8.4), from the mean pad temperature and its history.
 
     ``rise`` K is the present mean over the temperature at which the curve was identified (thesis T_p,c, equation 8-10; not
-    today's ambient, which says nothing of what the curve belongs to and can be lost); ``history`` K the same through a
+    the present ambient temperature, which is not that of the identification and can be lost); ``history`` K the same through a
     first-order lag, which forgets as the thesis's moving window does but needs one number instead of thousands.
     """
     return max(1.0 - p.softening * rise - p.softening_history * history, 0.1)

@@ -1,8 +1,8 @@
 """Torque balance: clamp force from motor torque, inertia and friction.
 
 Thesis 2.4 and 4.2: T_m = gamma F + J dw/dt + (mu F + eta) s. The thesis takes s = sgn of the angle difference; here s is a
-friction state that turns over within a presliding angle (Dahl, "A solid friction model", 1968), which also says what
-friction is while the motor stands still.
+friction state that turns over within a presliding angle (Dahl, "A solid friction model", 1968), which also gives the friction
+while the motor stands still.
 """
 
 from math import exp, sqrt
@@ -60,7 +60,7 @@ def friction_state(
 @njit
 def turned_unseen(variance: float, travel: float, presliding_angle: float) -> float:
     """Variance of the friction state after the motor may have gone to and fro over ``travel`` rad in all, less at a time than
-    its angle tells: friction is then anywhere between what the angle says and none."""
+    its angle shows: friction is then anywhere between that by the angle and none."""
     sigma = sqrt(variance)
     return sq(sigma + max(_BETWEEN - sigma, 0.0) * (1.0 - exp(-travel / presliding_angle)))
 

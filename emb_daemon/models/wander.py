@@ -1,10 +1,10 @@
 """A resolver whose zero wanders: its angle drifts, or counts of one direction are lost, a little in each sample.
 
-Over strokes and stops the angle must gain what the integrated speed says. What it gains beyond that is explained by a drift
-with time, a loss with the way whatever its direction, and two errors that come to nothing when the motor returns: the
-resolver's gain with the way, and the angle's age with the speed. All four are fitted together over some stops, so that the
-noise of the speed averages out. Which of angle and speed is wrong the fit cannot tell; the contact angle becomes uncertain by
-the difference.
+Over strokes and stops the angle must change by the integrated speed. A difference is explained by a drift with time, a loss
+with the travelled way in either direction, and two errors that vanish when the motor returns: a gain error of the resolver,
+proportional to the travel, and an age of the angle, proportional to the speed. All four are fitted together over some stops,
+so that the noise of the speed averages out. The fit cannot tell whether angle or speed is wrong; the contact angle becomes
+uncertain by the difference.
 """
 
 from math import exp, sqrt
@@ -20,10 +20,9 @@ _GAIN, _AGE, _RATE, _LOSS, _CAUSES = 0, 1, 2, 3, 4
 #: The present stretch: its duration, angle less integrated speed (``slip``, rad), integrated speed (``net`` rad), the same
 #: without sign while the motor turned (``way`` rad), and gained speed (rad/s). ``normal``, ``right``: weighted normal
 #: equations, which forget; ``lower``, ``half``: scratch. ``offset_weight``, ``offset_sum``: what the speed's offset was so
-#: far. ``strayed`` rad: slip of late. ``drift`` rad/s: what the angle gains with time over the integrated speed, ``rate``
-#: rad/s: what of that the speed's offset does not explain, and ``loss``: share of the way, where each is likely, else 0;
-#: ``found``: whether rate or loss is certain; ``unseen`` rad: what had strayed when that was found, until it has been taken
-#: into account.
+#: far. ``strayed`` rad: recent slip, leaky. ``drift`` rad/s: of the angle relative to the integrated speed; ``rate`` rad/s:
+#: its part that the speed's offset does not explain; ``loss``: share of the way; each 0 unless it is likely. ``found``:
+#: whether rate or loss is certain; ``unseen`` rad: ``strayed`` at that moment, until it has been taken into account.
 WANDER = np.dtype(
     [
         *fields("f8", "seconds slip net way gained"),
@@ -46,9 +45,9 @@ _KEPT_S = 40.0
 STANDING_RAD_PER_S = 3.0
 #: Priors as inverse variances: gain (share) and age (s) as `models.lateness` has them, drift (rad/s) and loss (share) unknown.
 _POSSIBLE = np.array([1.0 / 0.02**2, 1.0 / 0.01**2, 1.0 / 1.0**2, 1.0 / 0.1**2])
-#: Noise of a stretch beside the speed's: two counts of a 12-bit resolver, rad; and share of the way that the trapezoidal
-#: rule misses. A step a of the acceleration at the share x of a cycle T leaves a T² (x (1 - x) - 1/6) / 2, whose standard
-#: deviation is 0.037 a T²: four steps of 8000 rad/s² in a stroke of 10 rad make a thousandth of it.
+#: Noise of a stretch in addition to the speed's: two counts of a 12-bit resolver, rad; and share of the way that the
+#: trapezoidal rule misses. A step a of the acceleration at the share x of a cycle T leaves a T² (x (1 - x) - 1/6) / 2, whose
+#: standard deviation is 0.037 a T²: four steps of 8000 rad/s² in a stroke of 10 rad make a thousandth of it.
 COUNTS_RAD, _MISSED = 0.003, 0.001
 #: Offset of a healthy resolver's speed when nothing is known of it, rad/s, standard deviation: one count of the wire, which a
 #: speed that is cut off instead of rounded is off by, and a tenth of its noise. It shows as a drift that was always there, and
@@ -91,7 +90,7 @@ def leave_stretch(a: Record) -> None:
 
 @njit
 def forget_wander(a: Record) -> None:
-    """Begin anew: what was seen so far was beside a speed with another offset."""
+    """Begin anew, because the sums so far belong to a speed with another offset."""
     leave_stretch(a)
     a.offset_weight = a.offset_sum = a.strayed = a.drift = a.rate = a.loss = a.unseen = 0.0
     a.found = False

@@ -36,8 +36,8 @@ class Stream:
 
     Attributes:
         values: signals of the last good frame in the DBC's order and units; empty before the first.
-        received, missing, damaged: good frames; frames missing by the counter, whose complete turns the time tells; frames
-        with a wrong CRC or a repeated counter.
+        received, missing, damaged: good frames; frames missing by the counter, complete turns of which show in the elapsed
+        time; frames with a wrong CRC or a repeated counter.
     """
 
     cycle_ns: int
@@ -55,7 +55,7 @@ class Stream:
         return self.status <= contract.STATUS_DEGRADED
 
     def value(self, column: int) -> float | None:
-        """A signal of the last good frame; None before the first, or if the sender says not to use it."""
+        """A signal of the last good frame; None before the first, or if the Status forbids its use."""
         return self.values[column] if self.values and self.usable else None
 
     def take(self, values: list[float], status: int, counter: int, time_ns: int) -> bool:
@@ -65,8 +65,8 @@ class Stream:
             if step == 0 and elapsed < COUNTER_MODULO / 2:
                 self.damaged += 1
                 return False
-            # Complete turns of the counter show only in the elapsed time, and only of a sender that kept its schedule
-            # meanwhile: one that stood still has sent no more than its counter says.
+            # Complete turns of the counter show only in the elapsed time, and only if the sender kept its schedule: a sender
+            # that paused has not sent more frames than its counter shows.
             turns = max(0, round((elapsed - step) / COUNTER_MODULO))
             if abs(elapsed - step - COUNTER_MODULO * turns) <= _JITTER_CYCLES:
                 step += COUNTER_MODULO * turns
@@ -97,7 +97,7 @@ class Corner:
         if not math.isnan(force_kN):
             entry[1] = force_kN if math.isnan(entry[1]) else max(entry[1], force_kN)
 
-    def refer(self, force_N: float, time_ns: int) -> None:
+    def set_reference(self, force_N: float, time_ns: int) -> None:
         """Store ``force_N``, measured by a rig's force sensor."""
         self._reference_kN, self._reference_ns = 1e-3 * force_N, time_ns
 
@@ -117,7 +117,7 @@ class Corner:
         return float(sum(count for second, _, count in self._seconds if second == last))
 
     @property
-    def heard(self) -> bool:
+    def received(self) -> bool:
         return any(stream.received for stream in self.streams)
 
     @property
@@ -190,8 +190,8 @@ def broadcast_ids() -> list[int]:
 
 
 class Listener:
-    """All corners' broadcasts, and RIG_c_Force of `logs.live.ReferenceBus`. `hear` takes FRAME arrays as a bus returns them,
-    with times on the monotonic clock."""
+    """All corners' broadcasts, and RIG_c_Force of `logs.live.ReferenceBus`. `receive` takes FRAME arrays as a bus returns
+    them, with times on the monotonic clock."""
 
     def __init__(self):
         layout = default_layout()[0]
@@ -207,25 +207,25 @@ class Listener:
         self.reset()
 
     @property
-    def heard(self) -> list[Corner]:
+    def active(self) -> list[Corner]:
         """The corners from which broadcasts were received."""
-        return [corner for corner in self.corners if corner.heard]
+        return [corner for corner in self.corners if corner.received]
 
     def states(self, now_ns: int) -> dict[str, dict[str, Any]]:
         """`Corner.state` of each corner from which broadcasts were received, by name."""
-        return {corner.name: corner.state(now_ns) for corner in self.heard}
+        return {corner.name: corner.state(now_ns) for corner in self.active}
 
     def reset(self) -> None:
         """Forget everything."""
         self.corners: list[Corner] = [Corner(name, self._cycles) for name in CORNERS]
 
-    def hear(self, frames: np.ndarray) -> None:
+    def receive(self, frames: np.ndarray) -> None:
         for time_ns, data, can_id, length, flags in frames.tolist():
             place, rig = self._place.get(can_id), self._rigs.get(can_id)
             if flags & (EXTENDED | REMOTE | ERROR | FD):
                 continue
             if rig is not None and (force_N := _physical(data, self._force)) >= self._force[5]:
-                self.corners[rig].refer(force_N, time_ns)
+                self.corners[rig].set_reference(force_N, time_ns)
             if place is None:
                 continue
             kind, row = place

@@ -63,7 +63,7 @@ def watch(bus: Bus, title: str) -> None:
                 return
             if key in ("r", "R"):
                 listener.reset()
-            listener.hear(bus.drain())
+            listener.receive(bus.drain())
             now = time.monotonic_ns()
             pressed = key == " "
             paused ^= pressed
@@ -77,16 +77,16 @@ def listen(bus: Bus) -> tuple[Listener, int]:
     """Listen until one complete second of the clock was received; returns listener and time. Raises Unavailable: nothing is
     received for some seconds."""
     listener, start = _listener(bus), time.monotonic_ns()
-    heard_ns = 0
+    received_ns = 0
     while True:
         bus.wait(_DRAIN_S)
-        listener.hear(bus.drain())
+        listener.receive(bus.drain())
         now = time.monotonic_ns()
-        if not heard_ns and listener.heard:
-            heard_ns = now
-        if heard_ns and now // SECOND_NS > heard_ns // SECOND_NS + 1:
+        if not received_ns and listener.active:
+            received_ns = now
+        if received_ns and now // SECOND_NS > received_ns // SECOND_NS + 1:
             return listener, now
-        if not heard_ns and now - start > _WAIT_S * SECOND_NS:
+        if not received_ns and now - start > _WAIT_S * SECOND_NS:
             raise Unavailable(
                 f"bus: no broadcast of a daemon (0x200 to 0x233) within {_WAIT_S:g} s; is a daemon running on this bus?"
             )

@@ -94,7 +94,7 @@ def render(listener: Listener, now_ns: int, title: str, width: int, height: int,
     """The whole screen, ``width`` x ``height`` characters."""
     head = Text(f"emb-daemon monitor  {title}", style="bold", no_wrap=True, overflow="ellipsis")
     lines = [head]
-    corners = listener.heard
+    corners = listener.active
     if not corners:
         lines += [
             Text(""),
@@ -108,7 +108,7 @@ def render(listener: Listener, now_ns: int, title: str, width: int, height: int,
     lines = lines[: height - 1] + [Text("")] * (height - 1 - len(lines))
     foot = Text("q quit  space pause  r reset counts and history", style="reverse")
     if len(corners) and len(corners) < len(CORNERS):
-        foot.append(f"  only {', '.join(corner.name for corner in corners)} heard")
+        foot.append(f"  only {', '.join(corner.name for corner in corners)} received")
     if paused:
         foot.append("  PAUSED", style="bold yellow")
     for line in lines:

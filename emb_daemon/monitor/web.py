@@ -31,17 +31,17 @@ def state(listener: Listener, now_ns: int) -> dict[str, Any]:
     return {"timestamp": time.time(), "corners": listener.states(now_ns)}
 
 
-def _forces(said: dict) -> list:
+def _forces(current: dict) -> list:
     """The part of a `state` that a plot draws."""
-    corners = said["corners"].items()
-    return [said["timestamp"], {name: [corner["clamp_force_kN"], corner["clamp_force_sigma_kN"]] for name, corner in corners}]
+    names = ("clamp_force_kN", "clamp_force_sigma_kN")
+    return [current["timestamp"], {corner: [now[name] for name in names] for corner, now in current["corners"].items()}]
 
 
 class Web:
     """Serves one page, its events and metrics, to this machine only.
 
     Args:
-        port: 0 for any that is free; `port` says which.
+        port: 0 for any that is free; it is then the attribute `port`.
         title: name of the bus on the page.
     """
 
@@ -74,9 +74,9 @@ class Web:
             return
         with self._news:
             self._shown_s = time.monotonic()
-            said = state(listener, now_ns)
-            self._history.append(_forces(said))
-            self._state, self._metrics = json.dumps(said).encode(), exposition(listener, now_ns).encode()
+            current = state(listener, now_ns)
+            self._history.append(_forces(current))
+            self._state, self._metrics = json.dumps(current).encode(), exposition(listener, now_ns).encode()
             self._news.notify_all()
 
     def close(self) -> None:
@@ -116,16 +116,16 @@ class Web:
         request.send_response(200)
         request.send_header("Content-Type", "text/event-stream")
         request.end_headers()
-        said = self._everything()
+        event = self._everything()
         while True:
             try:
-                request.wfile.write(b"data: " + said + b"\n\n")
+                request.wfile.write(b"data: " + event + b"\n\n")
                 request.wfile.flush()
             except OSError:
                 return
             with self._news:
                 self._news.wait(5.0)
-                said = self._state
+                event = self._state
 
 
 class Datagrams:
@@ -163,7 +163,7 @@ def hand_out(bus: Bus, receivers: Sequence[Receiver], stopped: Callable[[], bool
         bus.wait(_HEAR_S)
         # Pause after the first frame, to take all frames of a period together.
         time.sleep(_HEAR_S)
-        listener.hear(bus.drain())
+        listener.receive(bus.drain())
         now = time.monotonic_ns()
         if shared:
             shared.follow(now)

@@ -126,7 +126,7 @@ def _corner_cycle(p, s, mode, target, rate, wheel_speed, wheel_gain, ambient, rn
     s.mean_current = current / SUBSTEPS
     # Ornstein-Uhlenbeck noise of the current sensor at four points of the cycle, averaged as the sensor does.
     decay = np.exp(-0.25 * CYCLE_S / p.current_noise_time)
-    # Variance of the mean of four such values, a quarter of a cycle apart, as a share of theirs.
+    # Variance of the mean of four such values, a quarter of a cycle apart, as a share of the variance of one.
     averaged = (4.0 + 6.0 * decay + 4.0 * decay**2 + 2.0 * decay**3) / 16.0
     spread = p.current_noise * np.sqrt((1.0 - decay * decay) / averaged)
     error = 0.0
@@ -326,7 +326,7 @@ def _run(w, rng, commands, drives, frames, truth):
 
 
 @njit
-def _hear(w, frames):
+def _receive(w, frames):
     """Read adaptation requests from the frames on the bus."""
     wires = w.wires[0]
     signals = wires.sent[wire.ADAPT_REQUEST]
@@ -431,6 +431,6 @@ class Car:
         count = _run(self._world, self._rng, commands, drives, frames, truth)
         return frames[:count].copy(), truth
 
-    def hear(self, frames: np.ndarray) -> None:
+    def receive(self, frames: np.ndarray) -> None:
         """Receive the daemon's frames: EMB_c_AdaptRequest starts and ends training motion."""
-        _hear(self._world, frames)
+        _receive(self._world, frames)

@@ -36,16 +36,16 @@ class LiveCar:
     def warm_up(self) -> None:
         """Compile, or load from the cache, what a cycle calls; the car stays as it is."""
         spare = Car(self.car.plants, self.car.corners)
-        spare.hear(spare.tick(self._commands[0], self._drives[0]))
+        spare.receive(spare.tick(self._commands[0], self._drives[0]))
 
     def run(
         self, stopped: Callable[[], bool], seconds: float | None = None, sent: Callable[[int, np.ndarray], None] | None = None,
-        heard: Callable[[np.ndarray], None] | None = None,
+        received: Callable[[np.ndarray], None] | None = None,
     ) -> None:  # fmt: skip
         """Run until ``stopped()`` or ``seconds`` are over.
 
         ``sent(time_ns, truth)`` is called after each cycle, with its TRUTH rows and the time when it left, 0 if it was lost;
-        ``heard(frames)`` is called with the frames received since. Both views are valid during the call only.
+        ``received(frames)`` is called with the frames received since. Both views are valid during the call only.
         """
         last = None if seconds is None else round(seconds * 1e9 / CYCLE_NS)
         deadline = time.monotonic_ns()
@@ -63,17 +63,17 @@ class LiveCar:
             if sent is not None:
                 sent(0 if lost else now, self.car.truth)
             deadline += CYCLE_NS
-            self._listen(deadline, heard)
+            self._listen(deadline, received)
 
-    def _listen(self, deadline: int, heard: Callable[[np.ndarray], None] | None) -> None:
+    def _listen(self, deadline: int, received: Callable[[np.ndarray], None] | None) -> None:
         while True:
             remaining = deadline - time.monotonic_ns()
             if remaining > 0:
                 self._bus.wait(1e-9 * remaining)
             frames = self._bus.drain()
             if len(frames):
-                self.car.hear(frames)
-                if heard is not None:
-                    heard(frames)
+                self.car.receive(frames)
+                if received is not None:
+                    received(frames)
             if remaining <= 0:
                 return

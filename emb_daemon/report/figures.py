@@ -161,10 +161,10 @@ def _draw(figure, row: int, panel: Panel, shown: set[str], detail: "_Detail | No
 
 
 def _extent(panel: Panel) -> list[float] | None:
-    """Range of a panel's axis if it has a band: all of its lines, and the band but for its widest samples; else plotly's.
+    """Range of a panel's axis if it has a band: all of its lines, and the band without its widest samples; else plotly's.
 
-    Before the contact angle is known, a standard deviation reaches to the largest force, and would leave of everything after
-    it a straight line."""
+    Before the contact angle is known, a standard deviation is as large as the largest force; on that scale everything later
+    would look like a straight line."""
     if not any(trace.style is BAND for trace in panel.traces):
         return None
     edges = []

@@ -24,7 +24,7 @@ _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
 
 
 class Bus(Protocol):
-    """A bus as the loop, the monitor and the workshop's servers use it; `RawCanSocket` and `PythonCanBus` say more of each.
+    """A bus as the loop, the monitor and the workshop's servers use it; details are in `RawCanSocket` and `PythonCanBus`.
 
     Attributes:
         dropped, unsent: frames that the receiver had no room for, and that the bus did not accept.

@@ -39,7 +39,7 @@ from emb_daemon.wire.receive import RECEPTION
 #: wakes.
 _MARGIN_NS = 200_000
 #: Time that a frame may take from its stamp into the queue before the loop treats it as missing. The loop waits for so long,
-#: because a replay of the recorded bus knows only the stamp and must decide the same.
+#: so that a replay of the recorded bus, which has only the stamps, makes the same decision.
 QUEUED_NS = 1_000_000
 #: Samples expected within this time of each other are estimated in one tick.
 _TOGETHER_NS = 400_000
@@ -177,8 +177,8 @@ class Daemon:
         self._reload_wanted = True
 
     def share(self, path: Path) -> None:
-        """Let other processes read the estimates of every tick in a file. If it cannot be written, the daemon runs without:
-        brakes need it more than those who look on."""
+        """Let other processes read the estimates of every tick in a file. If it cannot be written, the daemon runs without it,
+        because the estimates on the bus matter more."""
         try:
             self._shared = SharedEstimates(path, self.pipeline)
         except OSError as error:
@@ -350,17 +350,18 @@ class Daemon:
 
     def _answer_to(self, request: Request) -> Answer | None:
         """Change to a page that was read, all of its corners in one tick, or refuse it; None while the decision is open."""
-        now_ns, answer = time.monotonic_ns(), Answer(request.fault)
+        now_ns, answer = time.monotonic_ns(), Answer()
         request.read_ns = request.read_ns or now_ns
-        if not request.fault:
-            if request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
-                answer = Answer("checking it took too long", later=True)
-            elif self._waiting:
-                answer = Answer("a reload is waiting for the brakes to be released", later=True)
-            elif request.read and (why_not := self.pipeline.why_not_at_rest()):
-                if now_ns - request.read_ns < _SETTLING_NS:
-                    return None
-                answer = Answer(why_not, later=True)
+        if request.fault:
+            answer = Answer(request.fault)
+        elif request.read_ns - request.asked_ns > 1e9 * PATIENCE_S:
+            answer = Answer("checking it took too long", later=True)
+        elif self._waiting:
+            answer = Answer("a reload is waiting for the brakes to be released", later=True)
+        elif request.read and (why_not := self.pipeline.why_not_at_rest()):
+            if now_ns - request.read_ns < _SETTLING_NS:
+                return None
+            answer = Answer(why_not, later=True)
         if answer.refused:
             log.error("page refused: %s", answer.refused)
             return answer

@@ -1,4 +1,4 @@
-"""Online calibration: requests of the XCP server to the daemon, over a socket beside the file of the estimates.
+"""Online calibration: requests of the XCP server to the daemon, over a socket in the folder of the shared estimates.
 
 A `Page` contains the numbers in which each corner's calibration is to differ from its file. Only the daemon's user and root
 can use the socket. A page is never stored: it ends with the server that requested it, with a reload, and with the daemon.
@@ -74,7 +74,7 @@ class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Request:
-    """A page requested at ``asked_ns``, the calibrations ``read`` for it by ``read_ns``, and who waits for the answer."""
+    """A page requested at ``asked_ns``, the calibrations ``read`` for it by ``read_ns``, and the answer to wait for."""
 
     def __init__(self, page: Page):
         self.page = page
@@ -94,7 +94,7 @@ class Request:
 
 
 def socket_path(estimates: Path) -> Path:
-    """Path of the socket beside the file of the estimates."""
+    """Path of the socket, next to the file of the estimates."""
     return estimates.with_name(estimates.name + ".pages")
 
 

@@ -1,4 +1,4 @@
-"""Real-time set-up of the process; each measure says what it did or why it could not."""
+"""Real-time set-up of the process; each measure reports what it did or why it could not."""
 
 import ctypes
 import gc
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
-def lock_memory() -> str:
+def _lock_memory() -> str:
     libc = ctypes.CDLL(None, use_errno=True)
     # MCL_ONFAULT: memory that is mapped but never touched, such as stacks of helper threads, need not be resident.
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
@@ -18,6 +18,7 @@ def lock_memory() -> str:
 
 
 def use_fifo(priority: int) -> str:
+    """Give the calling thread SCHED_FIFO; returns a log line."""
     try:
         # For the calling thread only: threads that it starts, to read or write a file, get the ordinary scheduler.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
@@ -26,7 +27,7 @@ def use_fifo(priority: int) -> str:
     return f"SCHED_FIFO priority {priority}"
 
 
-def pin(cpu: int) -> str:
+def _pin(cpu: int) -> str:
     try:
         os.sched_setaffinity(0, {cpu})
     except OSError as error:
@@ -46,8 +47,8 @@ def settle_memory() -> None:
 def set_up(lock: bool, priority: int | None, cpu: int | None) -> Iterator[str]:
     """Apply the chosen measures, yielding one log line each."""
     if lock:
-        yield lock_memory()
+        yield _lock_memory()
     if cpu is not None:
-        yield pin(cpu)
+        yield _pin(cpu)
     if priority is not None:
         yield use_fifo(priority)

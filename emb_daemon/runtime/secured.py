@@ -21,8 +21,8 @@ _FORMAT = 1
 #: Reset counters that a sender may be ahead of the stored one. Frames of this time, 45 s of a corner's, can be played back to
 #: a daemon that was killed. Storing every reset counter would write to flash memory once a second.
 _RESETS_NOT_KEPT = 64
-#: Room on the disk for the counters of all links, taken at the first start: a daemon that a full disk kept from storing them
-#: would not start, and after a kill would believe everything that was sent since they were last stored.
+#: Room on the disk for the counters of all links, taken at the first start: a daemon that cannot store them on a full disk
+#: would not start, and after a kill would accept everything that was sent since they were last stored.
 _ROOM = 4096
 
 

@@ -191,7 +191,7 @@ class PresentEstimates:
         """Take what has been shared since the last call; ``now_ns`` on the monotonic clock."""
         self._reader.look()
         _, taken, _ = self._reader.take()
-        # A prediction knows neither the forces of the paths nor what is amiss.
+        # A prediction has neither the forces of the paths nor facts.
         self._rows.update((int(row["corner"]), row) for row in taken[taken["is_sample"]])
         self._now_ns, self._in_vain = now_ns, 0 if len(taken) else self._in_vain + 1
         why = self._reader.trouble or f"{self._reader.path}: no daemon shares its estimates there"

@@ -1,9 +1,9 @@
 """AES-128-CMAC in compiled code; each code takes constant time.
 
 Sources: FIPS 197 (AES), RFC 4493 (CMAC). A state of 16 bytes is held bit-sliced: word i consists of bit i of all bytes, byte n
-at bit n. The S-box is then Boolean arithmetic, and no address or branch depends on the key or on a message. A table would tell
-other processes of the machine, through the cache, which of its lines were read; only the round keys, once at the start, are
-made with one. The inverse in the S-box is computed in the tower GF(((2^2)^2)^2) with w^2 = w + 1, x^2 = x + w + 1,
+at bit n. The S-box is then Boolean arithmetic, and no address or branch depends on the key or on a message. With a table,
+other processes of the machine could find out through the cache which of its lines were read; a table is used only once, at the
+start, for the round keys. The inverse in the S-box is computed in the tower GF(((2^2)^2)^2) with w^2 = w + 1, x^2 = x + w + 1,
 y^2 = y + wx + w; the change of basis was found by search.
 """
 

@@ -2,7 +2,7 @@
 
 CRC-8-SAE-J1850 (polynomial 0x1D), with start value and final XOR of the profile both zero against the CRC library's 0xFF
 conventions, over the low and the high byte of the DataID and then payload bytes 1 to 7; counter 0..14.
-Source: AUTOSAR FO R22-11 PRS E2EProtocol, section 6.2; the house's wire contract puts DataID = CAN id.
+Source: AUTOSAR FO R22-11 PRS E2EProtocol, section 6.2; the DataID is the CAN id.
 """
 
 import numpy as np

@@ -241,7 +241,7 @@ def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) ->
     """
     # cantools, and python-can with it, take a third of the daemon's start.
     if path is None and (known := library.layout_of(resource("dbc/emb.dbc"))):
-        return _concerning(corners, np.frombuffer(known, LAYOUT).copy())
+        return _restrict(np.frombuffer(known, LAYOUT).copy(), corners)
     shipped = load_database(resource("dbc/emb.dbc"))
     database = load_database(path) if path else shipped
     layout, faults = np.zeros(1, LAYOUT), []
@@ -276,8 +276,8 @@ def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) ->
     return layout
 
 
-def _concerning(corners: tuple[str, ...], layout: np.ndarray) -> np.ndarray:
-    """A LAYOUT of all corners, of which the messages of others than ``corners`` are made foreign."""
+def _restrict(layout: np.ndarray, corners: tuple[str, ...]) -> np.ndarray:
+    """Make the messages of all other corners than ``corners`` foreign in a LAYOUT, in place; returns it."""
     record = layout[0]
     for index in (index for index, name in enumerate(CORNERS) if name not in corners):
         slots = slice(CORNER_MESSAGES * index, CORNER_MESSAGES * (index + 1))

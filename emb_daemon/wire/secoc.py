@@ -1,4 +1,4 @@
-"""Secure onboard communication: proves who sent a message, and that it is not an old one played back.
+"""Secure onboard communication: proves that a message is from its sender, and that it is not a replayed one.
 
 AUTOSAR SecOC in the form of its profile 1 (AES-128-CMAC, truncated; 8 bits of freshness on the wire), as a secured PDU
 collection with message linking, because resolver and current leave no room in their frames: an authentication frame follows
@@ -307,7 +307,7 @@ def _verify(frames, links, places, known):
             known[count] = frame
             count += 1
         elif place.which < 0:
-            count = _judge(links[place.link], frame.time_ns, frame.data, known, count)
+            count = _authenticate(links[place.link], frame.time_ns, frame.data, known, count)
         else:
             count = _hold(links[place.link], place.which, place.position, frame, known, count)
     return count
@@ -329,7 +329,7 @@ def _hold(link, which, position, frame, known, count):
 
 
 @njit
-def _judge(link, time_ns, data, known, count):
+def _authenticate(link, time_ns, data, known, count):
     """Pass on the frames that an authentication frame proves authentic, or refuse it."""
     number = np.int64(data >> np.uint64(16) & np.uint64(15))
     which = _SETS if number == FRESHNESS_SET else number

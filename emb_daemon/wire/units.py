@@ -63,7 +63,7 @@ def known_as(unit: str) -> str:
 
 
 def _spelt(unit: str) -> str:
-    """A unit as `UNITS` spells it, whatever stands between the factors of a torque; one that is unknown as it is."""
+    """A unit as `UNITS` spells it, with any separator between the factors of a torque; an unknown unit unchanged."""
     small = unit.lower()
     apart = re.sub(r"[ *·⋅.-]+", " ", small)
     return unit if unit in UNITS else _SPELLINGS.get(small) or _SPELLINGS.get(apart) or (apart if apart in UNITS else unit)

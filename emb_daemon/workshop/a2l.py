@@ -20,7 +20,7 @@ from emb_daemon.workshop.image import CORNER_ADDRESS, PARAMETERS_ADDRESS, VERSIO
 
 #: Name of the file, which the slave states too.
 NAME = "emb_daemon"
-#: The text at VERSION_ADDRESS, from which a tool knows that file and slave belong together.
+#: The text at VERSION_ADDRESS, by which a tool checks that file and slave belong together.
 VERSION = f"emb_daemon {__version__} " + hashlib.sha256(
     LAYOUT_DIGEST + repr([signal.name for signal in INPUTS + OUTPUTS]).encode()
 ).hexdigest()[:12]  # fmt: skip
@@ -112,7 +112,7 @@ def version_of(calibrations: Mapping[str, Calibration], calibrate: bool) -> str:
 
 
 def make_a2l(calibrations: Mapping[str, Calibration], connection: Connection | None = None, calibrate: bool = False) -> bytes:
-    """The file for a daemon that estimates the corners of ``calibrations``: ASCII, as ASAM MCD-2 MC wants it.
+    """The file for a daemon that estimates the corners of ``calibrations``: ASCII, as ASAM MCD-2 MC requires.
 
     With ``connection`` it states how the server is reached; with ``calibrate`` it contains the numbers that may be written.
     """

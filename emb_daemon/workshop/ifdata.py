@@ -19,7 +19,7 @@ _SIZES = {2: "SIZE_WORD", 4: "SIZE_DWORD"}
 
 
 class Connection(NamedTuple):
-    """A transport and the block that says where it is."""
+    """A transport and the block with its address."""
 
     layer: Transport
     block: str

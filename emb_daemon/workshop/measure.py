@@ -40,7 +40,7 @@ class Udp:
     The sender of the last CONNECT is the master; packets of others are ignored.
 
     Attributes:
-        gone: the master's machine reported that nobody listens any more.
+        gone: the master's machine reported that its port is closed.
     """
 
     layer = ON_UDP

@@ -118,7 +118,7 @@ class Diagnostics:
         self._not_stored, self._shared = "", PresentEstimates(estimates)
         self.listener: Listener = Listener()
         self.memory: TroubleMemory = TroubleMemory(state)
-        self._judged = [0] * len(CORNERS)
+        self._evaluated = [0] * len(CORNERS)
         self._server = Server(self.memory, data_of(configuration, state, self.listener.corners, self._shared))
         self._requests: list = []
         self._message = isotp.CanMessage
@@ -149,19 +149,19 @@ class Diagnostics:
         frames = self._bus.drain()
         # Only the newest frame of each message is used, which is five times less work.
         _, newest = np.unique(frames["can_id"][::-1], return_index=True)
-        self.listener.hear(frames[::-1][newest])
+        self.listener.receive(frames[::-1][newest])
         for data in payloads_to(self._request_id, frames):
             self._requests.append(self._message(arbitration_id=self._request_id, data=data))
         now = time.monotonic()
         self._shared.follow(time.monotonic_ns())
         for row, corner in enumerate(self.listener.corners):
             status = corner.streams[ESTIMATOR_STATUS]
-            if status.received != self._judged[row]:
-                self._judged[row] = status.received
+            if status.received != self._evaluated[row]:
+                self._evaluated[row] = status.received
                 mode, reasons = int(status.values[0]), int(status.values[3])
                 frame = frame_of(corner, self._shared.of(row), round(time.time()))
                 try:
-                    self.memory.judge(row, mode, reasons, frame, now)
+                    self.memory.evaluate(row, mode, reasons, frame, now)
                 except OSError as error:
                     # Codes that cannot be stored can still be read; storing is tried again with the next message.
                     self._not_stored = f"{self.memory.path}: {error.strerror}"

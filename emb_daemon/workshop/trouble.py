@@ -113,7 +113,7 @@ class TroubleMemory:
         self.path: Path = folder / FILE
         self.warning: str = ""
         self.entries: dict[int, Entry] = {code: Entry() for code in _INDEX}
-        self._row = [0] * CODES
+        self._consecutive = [0] * CODES
         self._dirty_s: float | None = None
         try:
             stored = files.decode(files.read(self.path), _Stored, _FORMAT)
@@ -133,17 +133,17 @@ class TroubleMemory:
         files.write(self.path, _Stored(_FORMAT, self.entries))
         self._dirty_s = None
 
-    def judge(self, corner: int, mode: int, reasons: int, frame: Frame, now_s: float) -> None:
+    def evaluate(self, corner: int, mode: int, reasons: int, frame: Frame, now_s: float) -> None:
         """Evaluate one EMB_c_EstimatorStatus. Mode INIT is skipped: no inputs are expected yet. Errors as `save`."""
         first = False
         if mode != INIT:
             for reason in range(len(REASONS)):
                 entry, index = self.entries[code_of(corner, reason)], corner * len(REASONS) + reason
-                self._row[index] = self._row[index] + 1 if reasons >> reason & 1 else 0
+                self._consecutive[index] = self._consecutive[index] + 1 if reasons >> reason & 1 else 0
                 before = entry.status
-                if self._row[index] >= _MATURE:
+                if self._consecutive[index] >= _MATURE:
                     first |= _fail(entry, frame)
-                elif self._row[index] == 0:
+                elif self._consecutive[index] == 0:
                     entry.status &= ~(TEST_FAILED | NOT_COMPLETED_SINCE_CLEAR | NOT_COMPLETED_THIS_CYCLE)
                 if entry.status != before and self._dirty_s is None:
                     self._dirty_s = now_s
@@ -162,7 +162,7 @@ class TroubleMemory:
             self.entries = kept
             raise
         for code in codes:
-            self._row[_INDEX[code]] = 0
+            self._consecutive[_INDEX[code]] = 0
         return True
 
 

@@ -1,6 +1,6 @@
 """The daemon in a process of its own, on an inherited socket, set up as ``emb-daemon run`` sets it up, with a stopwatch.
 
-Run as ``python -m emb_daemon.bench.served CONFIG STATE SHARE FD``. Prints a line when it is ready, with the CPU time that
+Run as ``python -m emb_daemon.bench.daemon CONFIG STATE SHARE FD``. Prints a line when it is ready, with the CPU time that
 took, and, after SIGTERM, a JSON line with what its ticks cost. SHARE is as in ``emb-daemon run --share``, empty for none.
 """
 
@@ -172,7 +172,7 @@ def main() -> None:
     realtime = setup.configuration.realtime
     measures = list(set_up(realtime.lock_memory, realtime.fifo_priority, realtime.cpu))
     settle_memory()
-    # Including the CPU time of a process that compiled beside this one.
+    # Including the CPU time of child processes, one of which may have compiled.
     print("ready", sum(os.times()[:4]), flush=True)
     daemon.run()
     gc.enable()
