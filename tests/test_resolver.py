@@ -10,6 +10,8 @@ from diagnosekit import drives
 from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator import resolver
+from emb_daemon.estimator.records import new_state
+from emb_daemon.models.plausibility import AGREE
 from emb_daemon.offline import estimate, load_log, log_of
 from emb_daemon.wire import contract as r
 
@@ -136,6 +138,29 @@ def test_samples_that_no_motor_turns_to_leave_nothing_behind(begin, angle_rad, s
     assert abs(estimates["contact_angle"] - good["contact_angle"])[begin + count :].max() < 0.3
     assert np.all(np.abs(estimates["force"] - force) < 3.5 * estimates["sigma"])
     assert estimates["sigma"][-1] < 2.0 * good["sigma"][-1]
+
+
+@pytest.mark.parametrize("begin", [800, 1900])
+@pytest.mark.parametrize(
+    ("angle_rad", "speed_rad_per_s", "count"),
+    [(0.2, 0.0, 1), (0.12, 0.0, 1), (-0.11, 0.0, 2), (0.51, -46.0, 3), (0.7, 46.0, 2), (84.0, 77.0, 1), (11.0, 50.0, 3)],
+)
+def test_wrong_messages_at_rest_turn_no_friction_over(begin, angle_rad, speed_rad_per_s, count):
+    """Nor do they leave a drift, a contact that is not confirmed any more, or a speed; and what they said is not learned from.
+    Friction of the other side was 4 kN some seconds later, and a drift that is none a minute without the stiffness path."""
+    samples, _ = city.drive()
+    samples, p = samples.copy(), to_parameters(shipped_calibration())
+    good, state, end = new_state(), new_state(), begin + count + 1
+    estimate(samples[:end], p, good)
+    samples["angle"][begin : begin + count] += angle_rad
+    samples["speed"][begin : begin + count] += speed_rad_per_s
+    estimates = estimate(samples[:end], p, state)
+    for name in ("friction_state", "friction_variance", "contact_angle", "drifting_s"):
+        assert state[name][0] == pytest.approx(good[name][0], abs=0.02), name
+    assert state["plausibility"]["verdict"][0] == AGREE and abs(state["speed"][0]) < 2.0
+    assert state["contact"]["confirmed"][0] == good["contact"]["confirmed"][0]
+    if abs(angle_rad) > 1.0:
+        assert np.all(np.isnan(estimates["innovation"][begin:end]))
 
 
 @pytest.mark.parametrize(("samples_away", "known"), [(5, True), (100, False)])
