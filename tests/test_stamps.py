@@ -14,6 +14,7 @@ from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.contradictions import _find_late_force, contradictions, starts_anew
 from emb_daemon.logs.currents import find_command, other_current, other_motor
 from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.overflow import overflown
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.series import Series
 from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays, without_sign
@@ -1230,3 +1231,60 @@ def test_a_load_is_asked_about_where_it_opposes_its_current_and_not_because_it_i
     told = [line for line in contradictions("FL", _swings_against(load, way)) if "scale: -1" in line]
     assert (said in told[0] and "ClampForceRef falls while CurrentQ rises" in told[0] if told else False) == bool(said)
     assert len(told) == bool(said)
+
+
+def _driven(current: np.ndarray) -> dict[str, Series]:
+    """A motor of 1 N·m/A at 300 Hz against a load that its current, less 2 A of friction, bears; by name."""
+    time_s = np.arange(len(current)) / 300.0
+    speed, times = 3.0 * np.sin(2.5 * time_s), np.round(1e9 * time_s).astype(np.int64)
+    noise = np.random.default_rng(3).normal(0.0, 0.5, len(current))
+    load = 400.0 * (current - 2.0 * np.sign(speed) - 0.3 * np.gradient(speed, time_s) + noise)
+    return {name: Series(times, values) for name, values in {"current": current, "speed": speed, "force": load}.items()}
+
+
+def _needed(seconds: float = 30.0) -> np.ndarray:
+    time_s = np.arange(round(300.0 * seconds)) / 300.0
+    return 20.0 * np.sin(2.1 * time_s) + 14.0 * np.sin(0.9 * time_s)
+
+
+@pytest.mark.parametrize("limit_A", [28.0, 22.0])
+@pytest.mark.parametrize("late", [0, 5])
+def test_a_current_whose_number_was_full_is_told_by_the_load_that_goes_on(limit_A, late):
+    """Also where it stays at the end for some samples first, and where it is full for a quarter of the time."""
+    needed = _needed()
+    told = _driven(needed)
+    numbered = np.clip(needed, -limit_A, limit_A)
+    beyond = np.convolve(np.abs(needed) > limit_A, np.ones(late + 1), "full")[: len(needed)] > late
+    full = np.where(beyond, needed - 2.0 * limit_A * np.sign(needed), numbered)
+    found = overflown(Series(told["current"].time_ns, full), told["speed"], told["force"])
+    assert np.array_equal(
+        found, (np.abs(needed) > limit_A) | (np.abs(full) == limit_A) | (full == full.max()) | (full == full.min())
+    )
+
+
+@pytest.mark.parametrize("follows", [True, False], ids=["load follows", "load of its own"])
+def test_a_current_that_is_turned_round_at_once_was_no_larger(follows):
+    turned = 20.0 * np.where(np.sin(4.0 * np.arange(9000) / 300.0) > 0.0, 1.0, -1.0)
+    turned += np.random.default_rng(4).normal(0.0, 0.3, len(turned))
+    told = _driven(turned if follows else _needed())
+    assert not np.any(overflown(Series(told["current"].time_ns, turned), told["speed"], told["force"]))
+    spiked = np.where(np.arange(9000) == 4000, 200.0, _needed())
+    assert not np.any(overflown(Series(told["current"].time_ns, spiked), told["speed"], told["force"]))
+    assert not np.any(overflown(Series(told["current"].time_ns, _needed()), told["speed"], told["force"]))
+
+
+def test_what_was_recorded_as_another_current_is_left_out_and_said(tmp_path, capsys):
+    needed = _needed()
+    told = _driven(needed)
+    angle = np.cumsum(told["speed"].values) / 300.0
+    columns = {"time_s": 1e-9 * told["current"].time_ns, "angle_rad": angle, "speed_rad_per_s": told["speed"].values}
+    columns |= {"plate_C": 22.0 + 0.0 * angle, "force_N": told["force"].values}
+    full = (needed + 30.0) % 60.0 - 30.0
+    gone = np.sum((np.abs(needed) > 30.0) | (full == full.max()) | (full == full.min()))
+    log = _read(tmp_path, columns | {"current_A": full})
+    said = capsys.readouterr().err
+    assert f"its number was full; {gone} of 9000 values are left out" in said
+    known = log.samples["has_current"]
+    assert 0.8 < np.mean(known) < 0.999
+    _read(tmp_path, columns | {"current_A": needed})
+    assert "number was full" not in capsys.readouterr().err

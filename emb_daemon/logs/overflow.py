@@ -1,4 +1,4 @@
-"""A current that was larger than the number it was recorded in: its highest value is followed by its lowest, and on from there.
+"""A current that was larger than the number it was recorded in: from its highest value it goes on at its lowest.
 
 That alone may be a motor that is turned round at once; load and acceleration tell the two apart, because they go on.
 """
@@ -8,12 +8,14 @@ import numpy as np
 from emb_daemon.logs.currents import JUDGED, LEAST, OTHERWISE
 from emb_daemon.logs.series import Series
 
-#: Least step, as a share of the range, from one end of a number to the other: what passes within a sample is less than the
-#: rest. Least range of what is left, as the same share: a motor that is only ever turned round stays at one end.
+#: Least step from one end of a number to the other, as a share of its range: less than the rest passes within a sample. Least
+#: range of what is left, as the same share: a motor that is only ever turned round stays at one end.
 _END_TO_END, _PASSES = 0.8, 0.5
 #: Share of a current's variance beside friction that load and acceleration explain from which they tell what it must be.
 _EXPLAINED = 0.5
-#: How often the stretches are told again from the last fit.
+#: Share of a step within which a stretch is clearly overflown, and share of the samples of which that must be so.
+_CLEAR, _MOST_CLEAR = 0.25, 0.9
+#: Number of fits to the better half, after which it hardly changes.
 _FITS = 10
 
 
@@ -21,7 +23,7 @@ def overflown(current: Series, speed: Series, force: Series | float) -> np.ndarr
     """Samples of a current that were recorded as another, because their number was full, shape (n,).
 
     Stretches between two steps from one end of the range to the other are held against what load, friction and acceleration
-    need by a fit to all others: they are overflown if nearer to it from beyond the end. Beside one the values at the ends
+    need: they are overflown if nearer to it from beyond the end, and most of those clearly. Beside one the values at the ends
     themselves are taken for more, too.
 
     Args:
@@ -38,32 +40,42 @@ def overflown(current: Series, speed: Series, force: Series | float) -> np.ndarr
     at, load = speed.sampled(current.time_ns), force.sampled(current.time_ns) if isinstance(force, Series) else 0.0
     rest = np.column_stack([np.ones(len(at)), np.sign(at), at])
     columns = np.column_stack([rest, np.broadcast_to(load, at.shape), np.gradient(at, 1e-9 * current.time_ns)])
-    known = np.isfinite(columns).all(axis=1)
+    known = np.flatnonzero(np.isfinite(columns).all(axis=1))
+    if len(known) < LEAST:
+        return nothing
+
+    # By least trimmed squares (Rousseeuw 1984), because what is overflown is far off.
+    fitted = known[:: len(known) // JUDGED + 1]
+    away_A = np.zeros(len(fitted))
+    for _ in range(_FITS):
+        best = fitted[away_A <= np.median(away_A)]
+        needed = columns @ np.linalg.lstsq(columns[best], values[best])[0]
+        away_A = np.abs(values - needed)[fitted]
+
     # By stretch, from which side it would have come: a fall from the highest value is passed upwards.
     side = np.sign(steps[jumps])
     before, after = np.append(0.0, -side), np.append(side, 0.0)
     beyond = np.where(before * after < 0.0, 0.0, np.sign(before + after))
-    stretch = np.searchsorted(jumps, np.arange(len(values)), side="left")
-    count = np.maximum(np.bincount(stretch, known, len(beyond)), 1.0)
-    at_end = (values == values.max()) | (values == values.min())
-    jump, taken = float(np.median(np.abs(steps[jumps]))), np.zeros(len(beyond), bool)
-    for _ in range(_FITS):
-        rows = np.flatnonzero(known & ~taken[stretch] & ~at_end)
-        rows = rows[:: len(rows) // JUDGED + 1]
-        if len(rows) < LEAST:
-            return nothing
-        needed = np.where(known, columns @ np.linalg.lstsq(columns[rows], values[rows])[0], values)
-        was, taken = taken, beyond * np.bincount(stretch, needed - values, len(beyond)) / count > 0.5 * jump
-        if np.array_equal(was, taken):
-            break
-    full = taken[stretch]
-    if not full.any() or np.ptp(values[rows]) < _PASSES * whole:
+    stretch, jump = np.searchsorted(jumps, np.arange(len(values)), side="left"), float(np.median(np.abs(steps[jumps])))
+    count = np.bincount(stretch[known], minlength=len(beyond))
+
+    def missing(needed: np.ndarray) -> np.ndarray:
+        """By stretch, what the mean of its values is short of, towards its side, in steps from one end to the other."""
+        return beyond * np.bincount(stretch[known], (needed - values)[known], len(beyond)) / np.maximum(count, 1) / jump
+
+    taken = missing(needed) > 0.5
+    full, at_end = taken[stretch], (values == values.max()) | (values == values.min())
+    right = known[~(full | at_end)[known]]
+    if not full.any() or len(right) < LEAST or np.ptp(values[right]) < _PASSES * whole:
         return nothing
+    undone = values + jump * np.where(full, beyond[stretch], 0.0)
+    needed = columns @ np.linalg.lstsq(columns[known], undone[known])[0]
+    clear = np.abs(missing(needed) - taken) < _CLEAR
 
     def left_A(columns: np.ndarray, values: np.ndarray) -> float:
         return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
 
-    explained = 1.0 - (left_A(columns[rows], values[rows]) / left_A(rest[rows], values[rows])) ** 2
-    undone = values + jump * np.where(full, beyond[stretch], 0.0)
+    explained = 1.0 - (left_A(columns[right], values[right]) / left_A(rest[right], values[right])) ** 2
     better = left_A(columns[known], values[known]) > OTHERWISE * left_A(columns[known], undone[known])
-    return full | at_end if explained > _EXPLAINED and better else nothing
+    sure = np.sum(count[clear & taken]) > _MOST_CLEAR * np.sum(count[taken])
+    return full | at_end if explained > _EXPLAINED and better and sure else nothing
