@@ -580,6 +580,19 @@ def test_cells_and_structures_of_matlab_are_named_as_matlab_does(tmp_path, capsy
         Mapping(tmp_path / "m.yaml").read(path)
 
 
+def test_of_a_recording_and_its_description_the_signals_are_offered(tmp_path):
+    """An object of system identification has a dozen lists beside its signals."""
+    experiments = np.empty(3, object)
+    experiments[:] = [np.random.default_rng(n).normal(size=(300, 2)) for n in range(3)]
+    described = {f"Current{n}": np.arange(3.0) for n in range(30)}
+    savemat(tmp_path / "a.mat", {"data": {"InputData": experiments, **described}})
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {rate_Hz: 250}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: Current, unit: rad}\n"
+    )
+    with pytest.raises(InputError, match=r"it has (data\.InputData\{\d\} column \d(, )?){6}$"):
+        Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mat")
+
+
 def test_numbers_and_texts_of_an_array_of_structures_are_columns(tmp_path):
     rows = np.zeros(200, [("at", object), ("angle", object)])
     rows["at"] = [f"2026-01-01T00:00:{0.004 * n:09.6f}" for n in range(200)]

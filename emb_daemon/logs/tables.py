@@ -227,7 +227,10 @@ def _of_arrays(path: Path, found: dict[str, np.ndarray | list], names: list[str]
 
     for name in names:
         if name not in found:
-            raise InputError(f"{path}: {name}: no such variable of numbers; it has {some_of(name, list(found))}")
+            # What describes a recording is shorter than its signals, and as often called alike.
+            longest = max(map(len, found.values()), default=0)
+            signals = [other for other, values in found.items() if 2 * len(values) > longest]
+            raise InputError(f"{path}: {name}: no such variable of numbers; it has {some_of(name, signals)}")
     lengths = {name: len(found[name]) for name in names}
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{name} {length}" for name, length in lengths.items())
