@@ -1242,9 +1242,10 @@ def _driven(current: np.ndarray) -> dict[str, Series]:
     return {name: Series(times, values) for name, values in {"current": current, "speed": speed, "force": load}.items()}
 
 
-def _needed(seconds: float = 30.0) -> np.ndarray:
-    time_s = np.arange(round(300.0 * seconds)) / 300.0
-    return 20.0 * np.sin(2.1 * time_s) + 14.0 * np.sin(0.9 * time_s)
+def _needed() -> np.ndarray:
+    """30 s, some of it beyond 28 A, with a few sudden steps."""
+    time_s = np.arange(9000) / 300.0
+    return 20.0 * np.sin(2.1 * time_s) + 14.0 * np.sin(0.9 * time_s) - 15.0 * ((time_s > 28.1) & (time_s < 28.3))
 
 
 @pytest.mark.parametrize("limit_A", [28.0, 22.0])
@@ -1271,6 +1272,34 @@ def test_a_current_that_is_turned_round_at_once_was_no_larger(follows):
     spiked = np.where(np.arange(9000) == 4000, 200.0, _needed())
     assert not np.any(overflown(Series(told["current"].time_ns, spiked), told["speed"], told["force"]))
     assert not np.any(overflown(Series(told["current"].time_ns, _needed()), told["speed"], told["force"]))
+
+
+def _smoothed(random: np.random.Generator, over: int) -> np.ndarray:
+    noise = np.convolve(random.normal(size=5999 + over), np.ones(over) / over, "valid")
+    return noise / noise.std()
+
+
+def _of_its_own(seed: int) -> list[Series]:
+    """A current that goes from one end to the other at random times, at once or almost, a speed and a load."""
+    random = np.random.default_rng(seed)
+    slow = _smoothed(random, random.integers(5, 200))
+    current = 20.0 * (np.sign(slow) if seed % 2 else np.clip(5.0 * slow, -1.0, 1.0)) + random.normal(0.0, 0.5, 6000)
+    speed, load = 3.0 * _smoothed(random, 100), 4000.0 * _smoothed(random, random.integers(5, 300))
+    return [Series(np.arange(6000) * 3_333_333, values) for values in (current, speed, load)]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 35, 99, 103, 145])
+def test_a_current_that_nothing_explains_is_left_as_it_is(seed):
+    assert not np.any(overflown(*_of_its_own(seed)))
+
+
+def test_a_recording_that_begins_and_ends_in_a_full_number_is_no_other():
+    needed = _needed()
+    rows = slice(int(np.argmax(needed > 30.0)), len(needed) - int(np.argmax(needed[::-1] < -30.0)))
+    told = {name: Series(s.time_ns[rows], s.values[rows]) for name, s in _driven(needed).items()}
+    full = np.where(np.abs(needed) > 28.0, needed - 56.0 * np.sign(needed), needed)[rows]
+    found = overflown(Series(told["current"].time_ns, full), told["speed"], told["force"])
+    assert found[0] and found[-1] and np.mean(found) < 0.3
 
 
 def test_what_was_recorded_as_another_current_is_left_out_and_said(tmp_path, capsys):

@@ -15,7 +15,7 @@ AGAINST = 0.5
 #: machines, and of 47 recordings, the motor's leaves up to 1.02 times as much, a supply's or one without its sign mostly 1.3
 #: and more. How often the signs of what a current needs are told again from the last fit, and how far, as a share of its
 #: range, a current without a sign goes to the other side: on a dynamometer that drives one way the motor's own goes by 0.04.
-OTHERWISE, _SIGNS, _OF_ONE_SIGN = 1.25, 10, 0.02
+_OTHERWISE, _SIGNS, _OF_ONE_SIGN = 1.25, 10, 0.02
 #: Share of the highest speed from which the motor moves.
 _MOVING = 0.05
 #: What is as good as the best.
@@ -225,12 +225,12 @@ def find_other_current(speed: Series, current: Series, force: Series | float) ->
 
     by_load_A, by_power_A = left_A(torques), left_A(torques * at[:, None])
     by_size_A = _left_by_size(values, np.hstack([rest[:, :3], torques])[known])
-    if by_load_A > OTHERWISE * by_size_A and by_size_A < by_power_A:
+    if by_load_A > _OTHERWISE * by_size_A and by_size_A < by_power_A:
         return [
             f"CurrentQ goes with the size of what load, friction and acceleration need, of which it leaves {by_size_A:.2g} A, "
             f"and not with that itself, which leaves {by_load_A:.2g} A: a phase's, an effective value? The motor's has a sign"
         ]
-    if not isinstance(force, Series) or not by_load_A > OTHERWISE * by_power_A:
+    if not isinstance(force, Series) or not by_load_A > _OTHERWISE * by_power_A:
         return []
     return [
         f"CurrentQ goes with the load times the speed, of which it leaves {by_power_A:.2g} A, and not with the load, which "

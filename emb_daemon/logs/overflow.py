@@ -5,7 +5,7 @@ That alone may be a motor that is turned round at once; load and acceleration te
 
 import numpy as np
 
-from emb_daemon.logs.currents import JUDGED, LEAST, OTHERWISE
+from emb_daemon.logs.currents import JUDGED, LEAST
 from emb_daemon.logs.series import Series
 
 #: Least step from one end of a number to the other, as a share of its range: less than the rest passes within a sample. Least
@@ -76,6 +76,5 @@ def overflown(current: Series, speed: Series, force: Series | float) -> np.ndarr
         return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
 
     explained = 1.0 - (left_A(columns[right], values[right]) / left_A(rest[right], values[right])) ** 2
-    better = left_A(columns[known], values[known]) > OTHERWISE * left_A(columns[known], undone[known])
     sure = np.sum(count[clear & taken]) > _MOST_CLEAR * np.sum(count[taken])
-    return full | at_end if explained > _EXPLAINED and better and sure else nothing
+    return full | at_end if explained > _EXPLAINED and sure else nothing
