@@ -580,6 +580,32 @@ def test_cells_and_structures_of_matlab_are_named_as_matlab_does(tmp_path, capsy
         Mapping(tmp_path / "m.yaml").read(path)
 
 
+@pytest.mark.parametrize("by", ["name", "place", "time by place"])
+def test_values_with_a_time_beside_each_go_by_that(tmp_path, by):
+    """A recorder's channels have rates of their own, and columns that end early."""
+    time_s = np.arange(5000) / 250.0
+    angle = 30.0 * (1.0 - np.cos(time_s))
+    columns = [("Time (s)", time_s), ("Angle", angle), ("Time (s)", time_s[::2]), ("Current", np.cos(time_s)[::2])]
+    columns += [("Time (s)", time_s[::5]), ("Force", 100.0 * angle[::5])]
+    rows = [[f"{values[row]:.6f}" if row < len(values) else "" for _, values in columns] for row in range(5000)]
+    lines = [",".join(name for name, _ in columns), *map(",".join, rows)]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    clock, *signals = ["column 1" if by != "name" else "Time (s)", "Angle", "Current", "Force"]
+    if by == "place":
+        signals = ["column 2", "column 4", "column 6"]
+    (tmp_path / "m.yaml").write_text(
+        f"format: 1\ntime: {{signal: {clock}}}\nsignals:\n"
+        f"  EMB_FL_Resolver.MotorAngle: {{signal: {signals[0]}, unit: rad}}\n"
+        f"  EMB_FL_Current.CurrentQ: {{signal: {signals[1]}, unit: A, mean_ms: 0}}\n"
+        f"  RIG_FL_Force.ClampForceRef: {{signal: {signals[2]}, unit: N}}\n"
+    )
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    known = np.isfinite(log.force_N)
+    assert known.mean() > 0.99 and log.samples["has_current"].mean() > 0.99
+    assert np.abs(log.force_N - 100.0 * log.samples["angle"])[known].max() < 60.0
+    assert np.abs(log.samples["current_q"] - np.cos(log.time_s))[log.samples["has_current"]].max() < 0.03
+
+
 def test_of_a_recording_and_its_description_the_signals_are_offered(tmp_path):
     """An object of system identification has a dozen lists beside its signals."""
     experiments = np.empty(3, object)
