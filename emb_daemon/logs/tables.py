@@ -79,8 +79,10 @@ def read_table(
         return found, {}, digest
     table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names], time.signal)
     units = {field.name: field.metadata[UNIT].decode() for field in table.schema if UNIT in (field.metadata or {})}
-    found = {}
-    for clock, own in _by_clock(table, names, time.signal).items():
+    found, clocks = {}, _by_clock(table, names, time.signal)
+    if len(clocks) > 1:
+        tell(f"{path}: several columns have the name of {time.signal}: each value goes by the last of them before it")
+    for clock, own in clocks.items():
         found |= _in_time(f"{path}", table, own, msgspec.structs.replace(time, signal=clock))
     return found, units, digest
 
@@ -205,15 +207,11 @@ def _table(path: Path, content: bytes, ending: str, names: list[str], clock: str
         # Its fields are columns, called `struct.field`.
         table = table.flatten()
     found = {name: place_of(name, table.column_names) for name in names}
-    called = clock if found.get(clock, 0) is None else table.column_names[found[clock]] if clock in found else None
-    clocks = [place for place, name in enumerate(table.column_names) if name == called]
-    if len(clocks) > 1:
-        first = clocks[0] if found[clock] is None else found[clock]
-        every = {place: f"column {place + 1}" for place in clocks} | {place: n for n, place in found.items() if n != clock}
-        if None not in every:
-            every[first] = clock
-            return table.select(sorted(every)).rename_columns([every[place] for place in sorted(every)])
-        found[clock] = first
+    its = found.get(clock)
+    clocks = [place for place, name in enumerate(table.column_names) if its is not None and name == table.column_names[its]]
+    every = {place: f"column {place + 1}" for place in clocks} | {place: name for name, place in found.items()}
+    if len(clocks) > 1 and None not in every and {*found} <= {*every.values()}:
+        return table.select(sorted(every)).rename_columns([every[place] for place in sorted(every)])
     for name, place in found.items():
         if place is None:
             count = table.column_names.count(name)
