@@ -580,6 +580,44 @@ def test_cells_and_structures_of_matlab_are_named_as_matlab_does(tmp_path, capsy
         Mapping(tmp_path / "m.yaml").read(path)
 
 
+@pytest.mark.parametrize("by_place", [True, False])
+def test_values_with_a_time_beside_each_go_by_that(tmp_path, capsys, by_place):
+    """A recorder's channels have rates of their own, and columns that end early."""
+    time_s = np.arange(5000) / 250.0
+    angle = 30.0 * (1.0 - np.cos(time_s))
+    columns = [("Time (s)", time_s), ("Angle", angle), ("Time (s)", time_s[::2]), ("Current", np.cos(time_s)[::2])]
+    columns += [("Time (s)", time_s[::5]), ("Force", 100.0 * angle[::5])]
+    rows = [[f"{values[row]:.6f}" if row < len(values) else "" for _, values in columns] for row in range(5000)]
+    lines = [",".join(name for name, _ in columns), *map(",".join, rows)]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    signals = ["column 2", "column 4", "column 6"] if by_place else ["Angle", "Current", "Force"]
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: column 1}\nsignals:\n"
+        f"  EMB_FL_Resolver.MotorAngle: {{signal: {signals[0]}, unit: rad}}\n"
+        f"  EMB_FL_Current.CurrentQ: {{signal: {signals[1]}, unit: A, mean_ms: 0}}\n"
+        f"  RIG_FL_Force.ClampForceRef: {{signal: {signals[2]}, unit: N}}\n"
+    )
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    assert "each value goes by the last of them before it" in capsys.readouterr().err
+    known = np.isfinite(log.force_N)
+    assert known.mean() > 0.99 and log.samples["has_current"].mean() > 0.99
+    assert np.abs(log.force_N - 100.0 * log.samples["angle"])[known].max() < 60.0
+    assert np.abs(log.samples["current_q"] - np.cos(log.time_s))[log.samples["has_current"]].max() < 0.03
+
+
+def test_of_a_recording_and_its_description_the_signals_are_offered(tmp_path):
+    """An object of system identification has a dozen lists beside its signals."""
+    experiments = np.empty(3, object)
+    experiments[:] = [np.random.default_rng(n).normal(size=(300, 2)) for n in range(3)]
+    described = {f"Current{n}": np.arange(3.0) for n in range(30)}
+    savemat(tmp_path / "a.mat", {"data": {"InputData": experiments, **described}})
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {rate_Hz: 250}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: Current, unit: rad}\n"
+    )
+    with pytest.raises(InputError, match=r"it has (data\.InputData\{\d\} column \d(, )?){6}$"):
+        Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mat")
+
+
 def test_numbers_and_texts_of_an_array_of_structures_are_columns(tmp_path):
     rows = np.zeros(200, [("at", object), ("angle", object)])
     rows["at"] = [f"2026-01-01T00:00:{0.004 * n:09.6f}" for n in range(200)]

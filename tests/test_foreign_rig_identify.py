@@ -15,7 +15,7 @@ from emb_daemon.calibration.files import load_calibration, shipped_calibration
 from emb_daemon.cli.main import main
 from emb_daemon.identify import validation
 from emb_daemon.identify.example import FILES
-from emb_daemon.identify.steps import attribution, stiffness
+from emb_daemon.identify.steps import attribution, noise, stiffness
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.write import write_frames
 from emb_daemon.plant import scenarios as sc
@@ -264,3 +264,14 @@ def test_a_slow_clamp_may_be_sampled_slowly(tmp_path, capsys, rate_Hz):
     estimates = emb_daemon.run(log, found)
     error = (estimates["force"] - log.force_N)[1:]
     assert np.sqrt(np.mean(error**2)) < 400.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("reached_N", "said"),
+    [
+        (2150.0, "no log clamps harder than 2.15 of 4.5 kN"),
+        (7630.0, "logs clamp up to 7.63 of 4.5 kN, but at angles so unlike"),
+    ],
+)
+def test_a_curve_that_is_unsure_at_the_largest_force_is_not_blamed_on_logs_that_reach_it(reached_N, said):
+    assert said in noise._unsure_at_the_end(reached_N, 4500.0, 1.0)

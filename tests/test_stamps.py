@@ -14,6 +14,7 @@ from emb_daemon.logs.columns import Decoder
 from emb_daemon.logs.contradictions import _find_late_force, contradictions, starts_anew
 from emb_daemon.logs.currents import find_command, other_current, other_motor
 from emb_daemon.logs.mapping import Mapping
+from emb_daemon.logs.overflow import overflown
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.series import Series
 from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays, without_sign
@@ -1230,3 +1231,89 @@ def test_a_load_is_asked_about_where_it_opposes_its_current_and_not_because_it_i
     told = [line for line in contradictions("FL", _swings_against(load, way)) if "scale: -1" in line]
     assert (said in told[0] and "ClampForceRef falls while CurrentQ rises" in told[0] if told else False) == bool(said)
     assert len(told) == bool(said)
+
+
+def _driven(current: np.ndarray) -> dict[str, Series]:
+    """A motor of 1 N·m/A at 300 Hz against a load that its current, less 2 A of friction, bears; by name."""
+    time_s = np.arange(len(current)) / 300.0
+    speed, times = 3.0 * np.sin(2.5 * time_s), np.round(1e9 * time_s).astype(np.int64)
+    noise = np.random.default_rng(3).normal(0.0, 0.5, len(current))
+    load = 400.0 * (current - 2.0 * np.sign(speed) - 0.3 * np.gradient(speed, time_s) + noise)
+    return {name: Series(times, values) for name, values in {"current": current, "speed": speed, "force": load}.items()}
+
+
+def _needed() -> np.ndarray:
+    """30 s, some of it beyond 28 A, with a few sudden steps."""
+    time_s = np.arange(9000) / 300.0
+    return 20.0 * np.sin(2.1 * time_s) + 14.0 * np.sin(0.9 * time_s) - 15.0 * ((time_s > 28.1) & (time_s < 28.3))
+
+
+@pytest.mark.parametrize("limit_A", [28.0, 22.0])
+@pytest.mark.parametrize("late", [0, 5])
+def test_a_current_whose_number_was_full_is_told_by_the_load_that_goes_on(limit_A, late):
+    """Also where it stays at the end for some samples first, and where it is full for a quarter of the time."""
+    needed = _needed()
+    told = _driven(needed)
+    numbered = np.clip(needed, -limit_A, limit_A)
+    beyond = np.convolve(np.abs(needed) > limit_A, np.ones(late + 1), "full")[: len(needed)] > late
+    full = np.where(beyond, needed - 2.0 * limit_A * np.sign(needed), numbered)
+    found = overflown(Series(told["current"].time_ns, full), told["speed"], told["force"])
+    assert np.array_equal(
+        found, (np.abs(needed) > limit_A) | (np.abs(full) == limit_A) | (full == full.max()) | (full == full.min())
+    )
+
+
+@pytest.mark.parametrize("follows", [True, False], ids=["load follows", "load of its own"])
+def test_a_current_that_is_turned_round_at_once_was_no_larger(follows):
+    turned = 20.0 * np.where(np.sin(4.0 * np.arange(9000) / 300.0) > 0.0, 1.0, -1.0)
+    turned += np.random.default_rng(4).normal(0.0, 0.3, len(turned))
+    told = _driven(turned if follows else _needed())
+    assert not np.any(overflown(Series(told["current"].time_ns, turned), told["speed"], told["force"]))
+    spiked = np.where(np.arange(9000) == 4000, 200.0, _needed())
+    assert not np.any(overflown(Series(told["current"].time_ns, spiked), told["speed"], told["force"]))
+    assert not np.any(overflown(Series(told["current"].time_ns, _needed()), told["speed"], told["force"]))
+
+
+def _smoothed(random: np.random.Generator, over: int) -> np.ndarray:
+    noise = np.convolve(random.normal(size=5999 + over), np.ones(over) / over, "valid")
+    return noise / noise.std()
+
+
+def _of_its_own(seed: int) -> list[Series]:
+    """A current that goes from one end to the other at random times, at once or almost, a speed and a load."""
+    random = np.random.default_rng(seed)
+    slow = _smoothed(random, random.integers(5, 200))
+    current = 20.0 * (np.sign(slow) if seed % 2 else np.clip(5.0 * slow, -1.0, 1.0)) + random.normal(0.0, 0.5, 6000)
+    speed, load = 3.0 * _smoothed(random, 100), 4000.0 * _smoothed(random, random.integers(5, 300))
+    return [Series(np.arange(6000) * 3_333_333, values) for values in (current, speed, load)]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 35, 99, 103, 145])
+def test_a_current_that_nothing_explains_is_left_as_it_is(seed):
+    assert not np.any(overflown(*_of_its_own(seed)))
+
+
+def test_a_recording_that_begins_and_ends_in_a_full_number_is_no_other():
+    needed = _needed()
+    rows = slice(int(np.argmax(needed > 30.0)), len(needed) - int(np.argmax(needed[::-1] < -30.0)))
+    told = {name: Series(s.time_ns[rows], s.values[rows]) for name, s in _driven(needed).items()}
+    full = np.where(np.abs(needed) > 28.0, needed - 56.0 * np.sign(needed), needed)[rows]
+    found = overflown(Series(told["current"].time_ns, full), told["speed"], told["force"])
+    assert found[0] and found[-1] and np.mean(found) < 0.3
+
+
+def test_what_was_recorded_as_another_current_is_left_out_and_said(tmp_path, capsys):
+    needed = _needed()
+    told = _driven(needed)
+    angle = np.cumsum(told["speed"].values) / 300.0
+    columns = {"time_s": 1e-9 * told["current"].time_ns, "angle_rad": angle, "speed_rad_per_s": told["speed"].values}
+    columns |= {"plate_C": 22.0 + 0.0 * angle, "force_N": told["force"].values}
+    full = (needed + 30.0) % 60.0 - 30.0
+    gone = np.sum((np.abs(needed) > 30.0) | (full == full.max()) | (full == full.min()))
+    log = _read(tmp_path, columns | {"current_A": full})
+    said = capsys.readouterr().err
+    assert f"its number was full; {gone} of 9000 values are left out" in said
+    known = log.samples["has_current"]
+    assert 0.8 < np.mean(known) < 0.999
+    _read(tmp_path, columns | {"current_A": needed})
+    assert "number was full" not in capsys.readouterr().err

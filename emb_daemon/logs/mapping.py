@@ -16,6 +16,7 @@ from emb_daemon.logs.contradictions import contradictions, has_dead_current, sta
 from emb_daemon.logs.dbc import load_foreign
 from emb_daemon.logs.foreign_frames import alone, decoded
 from emb_daemon.logs.mapping_file import Bus, Mapped, MappingFile, Source
+from emb_daemon.logs.overflow import overflown
 from emb_daemon.logs.read import ids_in, read_log
 from emb_daemon.logs.resample import (
     HEADER,
@@ -281,7 +282,8 @@ class Mapping:
                     f"{path}: {corner}: CurrentQ is 0 throughout, while the motor turns: it is taken as not measured, and the "
                     "force rests on the motor angle alone"
                 )
-            for line in (*contradictions(corner, messages), *_too_slow(corner, messages)):
+            lines = _without_overflow(corner, messages)
+            for line in (*lines, *contradictions(corner, messages), *_too_slow(corner, messages)):
                 tell(f"{path}: {corner}: {line}")
         for name in messages:
             if name.endswith("_Resolver") and not self._sources(name):
@@ -349,6 +351,21 @@ def _per_radius(unit: str) -> str:
         return f"{conversion(unit, 'm/s')[0]:.4g}"
     except InputError:
         return "its m/s"
+
+
+def _without_overflow(corner: str, messages: dict) -> list[str]:
+    """A line on the samples of a corner's current that were recorded as another, which are taken out of ``messages``."""
+    angle, own = way_of(corner, messages), messages.get(f"EMB_{corner}_Current", {})
+    current, force = own.get("CurrentQ"), messages.get(f"RIG_{corner}_Force", {}).get("ClampForceRef", 0.0)
+    if angle is None or not isinstance(current, Series) or not np.any(full := overflown(current, angle.derivative(), force)):
+        return []
+    low, high = float(np.min(current.values)), float(np.max(current.values))
+    own["CurrentQ"] = Series(current.time_ns[~full], current.values[~full])
+    return [
+        f"CurrentQ goes from {high:.4g} A to the other end of its range, {low:.4g} A, or back, where load and acceleration go "
+        f"on: its number was full; {np.sum(full)} of {len(full)} values are left out. A range that it does not leave, or a "
+        "smaller current, would tell more"
+    ]
 
 
 def _too_slow(corner: str, messages: dict) -> list[str]:

@@ -8,6 +8,7 @@ import re
 from datetime import UTC, datetime
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from emb_daemon.errors import InputError, tell
@@ -76,9 +77,14 @@ def read_table(
         parts = {name: table.filter(_named(path, table[time.name], name)) for name in names}
         found = {name: _in_time(f"{path}: {name}", part, [time.value], time)[time.value] for name, part in parts.items()}
         return found, {}, digest
-    table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names])
+    table = _table(path, content, ending, [*([] if time.signal is None else [time.signal]), *names], time.signal)
     units = {field.name: field.metadata[UNIT].decode() for field in table.schema if UNIT in (field.metadata or {})}
-    return _in_time(f"{path}", table, names, time), units, digest
+    found, clocks = {}, _by_clock(table, names, time.signal)
+    if len(clocks) > 1:
+        tell(f"{path}: several columns have the name of {time.signal}: each value goes by the last of them before it")
+    for clock, own in clocks.items():
+        found |= _in_time(f"{path}", table, own, msgspec.structs.replace(time, signal=clock))
+    return found, units, digest
 
 
 def _named(path: Path, column, name: str):
@@ -167,8 +173,21 @@ def _other_unit(largest_s: float, time) -> str:
     return ""
 
 
-def _table(path: Path, content: bytes, ending: str, names: list[str]):
-    """The table in a file (pyarrow.Table), with ``names`` as its columns."""
+def _by_clock(table, names: list[str], clock: str | None) -> dict[str | None, list[str]]:
+    """Which of a table's columns with ``names`` go by which column of times: where several stand in it under one name, as of
+    recorders that write a time beside each value, by the next one before them."""
+    places = {name: place for place, name in enumerate(table.column_names)}
+    clocks = [name for name in table.column_names if name not in names]
+    found: dict[str | None, list[str]] = {}
+    for name in names:
+        before = [other for other in clocks if places[other] < places[name]]
+        found.setdefault(before[-1] if before and len(clocks) > 1 else clock, []).append(name)
+    return found
+
+
+def _table(path: Path, content: bytes, ending: str, names: list[str], clock: str | None = None):
+    """The table in a file (pyarrow.Table), with ``names`` as its columns; where several have the name of the ``clock`` among
+    them, these too, in their places."""
     import pyarrow
     import pyarrow.feather
     import pyarrow.parquet
@@ -188,6 +207,11 @@ def _table(path: Path, content: bytes, ending: str, names: list[str]):
         # Its fields are columns, called `struct.field`.
         table = table.flatten()
     found = {name: place_of(name, table.column_names) for name in names}
+    its = found.get(clock)
+    clocks = [place for place, name in enumerate(table.column_names) if its is not None and name == table.column_names[its]]
+    every = {place: f"column {place + 1}" for place in clocks} | {place: name for name, place in found.items()}
+    if len(clocks) > 1 and None not in every and {*found} <= {*every.values()}:
+        return table.select(sorted(every)).rename_columns([every[place] for place in sorted(every)])
     for name, place in found.items():
         if place is None:
             count = table.column_names.count(name)
@@ -227,7 +251,10 @@ def _of_arrays(path: Path, found: dict[str, np.ndarray | list], names: list[str]
 
     for name in names:
         if name not in found:
-            raise InputError(f"{path}: {name}: no such variable of numbers; it has {some_of(name, list(found))}")
+            # What describes a recording is shorter than its signals, and as often called alike.
+            longest = max(map(len, found.values()), default=0)
+            signals = [other for other, values in found.items() if 2 * len(values) > longest]
+            raise InputError(f"{path}: {name}: no such variable of numbers; it has {some_of(name, signals)}")
     lengths = {name: len(found[name]) for name in names}
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{name} {length}" for name, length in lengths.items())

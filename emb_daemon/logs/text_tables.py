@@ -90,7 +90,11 @@ def read_text(path: Path, content: bytes, names: list[str]) -> Any:
     by_place = all(map(_BY_PLACE.fullmatch, names))
     if not {*names} & {*cells} and (found := _without_header(lines, by_place)):
         header, delimiter = found
+        above = _cells(lines[header], delimiter) if header >= 0 else []
         cells = [f"column {number + 1}" for number in range(len(_cells(lines[header + 1], delimiter)))]
+        # By their names columns of times are known to be such.
+        if len(above) == len(cells) and not any(map(_is_number, above)):
+            cells = above
     elif not {*names} & {*cells}:
         # What is then said of the names is of what stands above the numbers.
         header, delimiter = _above_numbers(lines) or (header, delimiter)

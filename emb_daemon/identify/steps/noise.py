@@ -95,11 +95,7 @@ def identify(
     rated = campaign.datasheet.actuator.rated_clamp_force_N
     beyond = _extrapolation(stiffness, rated)
     if beyond > _TOLD:
-        campaign.fault(
-            f"curves: no log clamps harder than {1e-3 * stiffness.reached_N:.3g} of {1e-3 * rated:.3g} kN, and a cubic that "
-            f"goes on leaves {100.0 * beyond:.3g} % of the largest force unsure; sigma holds that share of any force; "
-            "needed: a slow clamp to the largest force"
-        )
+        campaign.fault(_unsure_at_the_end(stiffness.reached_N, rated, beyond))
     levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], beyond))
     # The daemon does not know how worn its gear is.
     levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
@@ -126,6 +122,21 @@ def _extrapolation(stiffness: StiffnessStep, rated_N: float) -> float:
         if travel > curve.travel_rad:
             worst = max(worst, float(curve.force_sigma(np.array([travel]))[0]) / rated_N)
     return min(worst, 1.0)
+
+
+def _unsure_at_the_end(reached_N: float, rated_N: float, beyond: float) -> str:
+    """A line on curves whose force is unsure by the share ``beyond`` at the largest force, for want of logs or in spite of
+    them."""
+    reached = f"{1e-3 * reached_N:.3g} of {1e-3 * rated_N:.3g} kN"
+    told = f"leaves {100.0 * beyond:.3g} % of the largest force unsure; sigma holds that share of any force; needed:"
+    if reached_N < rated_N:
+        return (
+            f"curves: no log clamps harder than {reached}, and a cubic that goes on {told} a slow clamp to the largest force"
+        )
+    return (
+        f"curves: logs clamp up to {reached}, but at angles so unlike that their cubic {told} logs in which the angle counts "
+        "from one place, or one log alone"
+    )
 
 
 def speed_noise(logs: list[Log]) -> float | None:
