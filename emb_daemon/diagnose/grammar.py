@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
-from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model
+from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, noise_left
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
@@ -28,7 +28,6 @@ from emb_daemon.diagnose.prospects import (
     Search,
     coordinate_of,
     description_length,
-    noise_left,
     with_term,
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS

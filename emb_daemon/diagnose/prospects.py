@@ -14,12 +14,11 @@ from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.diagnose.coordinates import Coordinate, Move
 from emb_daemon.diagnose.evidence import Averaging, Evidence
 from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, enumerate_products, harmonic, rippling
-from emb_daemon.diagnose.model import LASTING, Model
+from emb_daemon.diagnose.model import LASTING, Model, noise_left
 from emb_daemon.diagnose.orders import strongest_orders
-from emb_daemon.diagnose.residuals import SIDE_BY_SIDE, Bench, Probe
+from emb_daemon.diagnose.residuals import Bench, Probe
 from emb_daemon.diagnose.selection import NOT_OF_A_FREE_MOTOR
 from emb_daemon.diagnose.signals import OF_A_BRAKE
-from emb_daemon.diagnose.unexplained import sample_noise
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
 from emb_daemon.effects.terms import PARAMETERS, PORTS, SIGNALS, evaluate
 from emb_daemon.errors import InvalidValue
@@ -479,10 +478,3 @@ def description_length(left: Any, numbers: Any, episodes: int) -> Any:
     """Description length of a squared error and the numbers of what left it, or of arrays of these; an episode counts as one
     observation."""
     return 0.5 * episodes * np.log(left) + 0.5 * numbers * np.log(episodes)
-
-
-def noise_left(model: Model, channel: str, samples: int) -> float:
-    """Squared error that no term explains, of means over ``samples``."""
-    residual = model.residual[channel]
-    counted = np.count_nonzero(residual * model.bench.means(channel, samples).told)
-    return counted * sample_noise(residual, SIDE_BY_SIDE.get(channel, 1)) ** 2 / samples
