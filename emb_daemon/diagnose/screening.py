@@ -138,7 +138,8 @@ class Screening:
         if channel == "temperature" and not made:
             return _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
-        of_lasting = _OF_A_TERM if made and model.bench.clamps else _LASTING_SHARE
+        term = made and channel in FORCE_CHANNELS and model.bench.clamps
+        of_lasting = _OF_A_TERM if term else _LASTING_SHARE
         lasting = of_lasting * np.sqrt(model.lasting(channel, LASTING[channel]))
         left = min(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), lasting)
         return float(max(left, share * self._size[channel]))
