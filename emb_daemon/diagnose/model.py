@@ -340,9 +340,10 @@ def is_shape(coordinate: Coordinate) -> bool:
     return coordinate.name in _SHAPES
 
 
-def noise_left(model: Model, channel: str, samples: int) -> float:
-    """Squared error that no term explains, of means over ``samples``."""
+def noise_left(model: Model, channel: str, samples: int) -> np.ndarray:
+    """Squared error of each episode that no term explains, of means over ``samples``, shape (episodes,)."""
     means = model.bench.means(channel, samples)
     told = model.residual[channel] * means.told
     # Each mean has the same variance, of however few samples it is, because it is weighted by their number.
-    return np.count_nonzero(means.of(told[:, None])) * noise_of_means(told, samples, SIDE_BY_SIDE.get(channel, 1))
+    counted = np.bincount(means.episode, means.of(told[:, None])[:, 0] != 0.0, model.bench.episodes)
+    return counted * noise_of_means(told, samples, SIDE_BY_SIDE.get(channel, 1))

@@ -85,6 +85,11 @@ class Screen:
         self.residual: np.ndarray = self.beside_nuisances(averaged[:, -1:])
         self.keep: np.ndarray = model.residual[channel] != 0.0
 
+    @property
+    def noise_scatter(self) -> float:
+        """Relative standard deviation of the squared error that noise leaves."""
+        return float(np.sqrt(2.0 / max(np.count_nonzero(self.means.per_mean), 1)))
+
     def beside_nuisances(self, averaged: np.ndarray) -> np.ndarray:
         """What of averaged columns the nuisances cannot take."""
         return averaged - self.nuisances @ (self._inverse @ (self.nuisances.T @ averaged))
@@ -191,12 +196,14 @@ class Search:
         """The best forms, through the estimator, with their sizes fitted; shortest description first. Of two signals only
         where one leaves more than ``floor`` (RMS, in the channel's unit) that lasts, and if the best is one of them."""
         model, samples = self.model, LASTING[self.channel]
-        alone = float(model.left_out(self.channel, samples=samples).sum())
-        alone -= noise_left(model, self.channel, samples)
+        noise = float(noise_left(model, self.channel, samples).sum())
+        alone, least = float(model.left_out(self.channel, samples=samples).sum()) - noise, noise * self.screen.noise_scatter
 
         def shortest(found: Sequence[Prospect]) -> list[Prospect]:
             kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p) and self.is_within(_term_of(p))]
-            return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+            # The noise is an estimate, which may be more than the best leaves: all would leave nothing.
+            most = max((p.evidence.gain for p in kept), default=0.0)
+            return sorted(kept, key=lambda p: _length(p, max(alone, most + least), model.bench.episodes))
 
         single = shortest([*self._run(_sharpen(self, self.forms, self.gains)), *self.ripples()])
         most = max((p.evidence.gain for p in single), default=0.0)
