@@ -364,6 +364,12 @@ def test_of_two_fits_the_shorter_description_is_taken_and_what_does_not_matter_i
     assert np.argmin(grammar._lengths_fitted(bare, channel, pairs, np.ones((1, 40)))) == first
 
 
+def test_where_noise_is_estimated_as_more_than_is_left_the_fit_that_leaves_less_is_still_better():
+    squared = np.array([[100.0, 50.0], [70.0, 90.0]])
+    beyond = grammar._beyond(squared, np.array([120.0, 20.0]), 4.0)
+    assert beyond.tolist() == [[30.0, 30.0], [4.0, 70.0]]
+
+
 def test_a_gate_and_a_second_signal_lengthen_every_description(coupled):
     """Those of a term that is in use as those of one that is asked for."""
     selection = coupled[0]
