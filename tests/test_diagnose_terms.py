@@ -336,6 +336,10 @@ def test_resampled_episodes_choose_the_shorter_description(monkeypatch):
     assert grammar._shares(screen, offered)["stiffness", "energy"] > 0.8
     offered[0].form.numbers = 3
     assert grammar._shares(screen, offered)["stiffness", "energy"] < 0.5
+    # Also where noise is estimated as more than is left.
+    monkeypatch.setattr(grammar, "noise_left", lambda *_: np.full(40, 20.0))
+    offered = [_prospect("stiffness", ("energy",), 3, 1.0, [long]), _prospect("stiffness", ("current",), 2, 1.0, [other])]
+    assert grammar._shares(screen, offered)["stiffness", "energy"] > 0.8
 
 
 @pytest.mark.parametrize(
