@@ -15,14 +15,14 @@ from emb_daemon.diagnose import diagnosis
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.diagnosis import diagnose
 from emb_daemon.diagnose.evidence import Averaging
-from emb_daemon.diagnose.model import LASTING, Model, rms_known
+from emb_daemon.diagnose.model import LASTING, Model, noise_left, rms_known
 from emb_daemon.diagnose.page import _left
 from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.selection import Selection
 from emb_daemon.diagnose.signals import MANOEUVRES, smooth_basis
 from emb_daemon.diagnose.text import verdict
-from emb_daemon.diagnose.unexplained import Dependence, Left, achieved
+from emb_daemon.diagnose.unexplained import Dependence, Left, achieved, noise_of_means
 from emb_daemon.effects.stribeck_friction import EFFECT
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.offline import log_of
@@ -222,3 +222,41 @@ def test_of_what_the_calibration_achieved_means_keep_what_lasts(calibration):
     assert achieved(slow, "torque", force, none, 32) == pytest.approx(one, rel=0.01)
     lasting = moved(white, {"noise.torque_lasting": 0.1})
     assert achieved(lasting, "torque", force, none, 32) == pytest.approx(np.hypot(many, 500.0), rel=0.1)
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.4])
+def test_noise_of_means_is_what_a_sensor_s_filter_leaves_of_them_and_nothing_slower(alike):
+    """White noise, and such in which neighbouring samples are alike, beside a residual that lasts for seconds."""
+    rng = np.random.default_rng(5)
+    white = rng.standard_normal(60000)
+    noise = np.zeros_like(white)
+    for index in range(1, len(white)):
+        noise[index] = alike * noise[index - 1] + white[index]
+    means = noise.reshape(-1, 32).mean(axis=1)
+    slow = np.sin(2.0 * np.pi * np.arange(len(white)) / 500.0)
+    for residual in (noise, noise + slow):
+        assert noise_of_means(residual, 32) == pytest.approx(32.0 * means.var(), rel=0.1)
+
+
+def test_each_mean_has_its_noise_in_its_own_episode_however_few_samples_it_is_of():
+    rng = np.random.default_rng(6)
+    episode = np.repeat([0, 1, 2], [32000, 16000, 3200])
+    means = Averaging(episode, 32, rng.uniform(size=len(episode)) < 0.5)
+    residual = rng.standard_normal(len(episode))
+    model = SimpleNamespace(bench=SimpleNamespace(episodes=3, means=lambda *_: means), residual={"torque": residual})
+    # Samples that do not count say nothing of noise, so neighbours that both count do.
+    left = noise_left(model, "torque", 32)
+    squared = np.square(means.of(residual[:, None])[:, 0])
+    assert left == pytest.approx(np.bincount(means.episode, squared), rel=0.2)
+
+
+def test_less_is_asked_of_a_term_of_a_brake_than_of_an_effect():
+    """A term has to be above chance over the whole grammar as well."""
+    for clamps in (True, False):
+        model = SimpleNamespace(
+            bench=SimpleNamespace(clamps=clamps), lasting=lambda *_: 100.0**2, noise=lambda _: 600.0**2
+        )  # fmt: skip
+        screening = Screening.__new__(Screening)
+        screening._size = {"torque": 3000.0}
+        effect, term = (screening.floor(model, "torque", made=made) for made in (False, True))
+        assert effect == pytest.approx(20.0) and term == pytest.approx(15.0 if clamps else 20.0)

@@ -17,7 +17,7 @@ from emb_daemon.diagnose import selection as selection_module
 from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.diagnosis import diagnose, with_terms
-from emb_daemon.diagnose.evidence import Evidence
+from emb_daemon.diagnose.evidence import Averaging, Evidence
 from emb_daemon.diagnose.forms import enumerate_forms, harmonic, made_effect
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.page import page
@@ -253,7 +253,7 @@ def test_an_effect_gives_way_to_no_more_terms_than_stood_beside_it(coupled, monk
     with_both, two_shapes = selection.entered([growth]), selection.noted([further])
     monkeypatch.setattr(grammar, "_with_terms", lambda bare, channel: two_shapes)
     monkeypatch.setattr(grammar, "one_round", lambda terms: terms)
-    assert grammar._description(two_shapes, "stiffness") < grammar._description(with_both, "stiffness")
+    assert grammar._is_shorter(two_shapes, with_both, "stiffness")
     catalogue = with_both.without(name, "what the catalogue alone had found")
     assert grammar._without_shadows(with_both, catalogue, "stiffness") is with_both
 
@@ -268,9 +268,8 @@ def test_a_further_shape_of_one_place_is_a_shorter_description_than_another_plac
         for hook in (first.effect.hook, "thickness")
     )
     with_shape, with_place = (selection.noted([other]) for other in (further, elsewhere))
-    assert grammar._description(with_shape, "stiffness") == grammar._description(selection, "stiffness")
-    more = grammar._description(with_place, "stiffness") - grammar._description(selection, "stiffness")
-    assert np.log(20) < more < np.log(60)
+    alone, same, more = grammar._descriptions([selection, with_shape, with_place], "stiffness")
+    assert same == alone and np.log(20) < more - alone < np.log(60)
     # Where no single shape will do, two of one place are tried before another place is believed.
     monkeypatch.setattr(grammar, "_in_shapes", lambda start, *_: [with_shape] if start is selection else [])
     assert grammar._restated(with_place, selection, "stiffness") is with_shape
@@ -324,14 +323,23 @@ def test_resampled_episodes_choose_the_shorter_description(monkeypatch):
         return prospects.Scores(u, a)
 
     screen = SimpleNamespace(
-        model=None, channel="stiffness", means=SimpleNamespace(episode=episode), residual=residual[:, None], scores=scores
+        model=None,
+        channel="stiffness",
+        means=SimpleNamespace(episode=episode),
+        residual=residual[:, None],
+        scores=scores,
+        noise_scatter=0.0,
     )
-    monkeypatch.setattr(grammar, "noise_left", lambda *_: 0.0)
+    monkeypatch.setattr(grammar, "noise_left", lambda *_: np.zeros(40))
     offered = [_prospect("stiffness", ("energy",), n, 1.0, [x]) for n, x in ((3, short),)]
     offered.insert(0, _prospect("stiffness", ("disc_speed",), 5, 1.001, [long]))
     assert grammar._shares(screen, offered)["stiffness", "energy"] > 0.8
     offered[0].form.numbers = 3
     assert grammar._shares(screen, offered)["stiffness", "energy"] < 0.5
+    # Also where noise is estimated as more than is left.
+    monkeypatch.setattr(grammar, "noise_left", lambda *_: np.full(40, 20.0))
+    offered = [_prospect("stiffness", ("energy",), 3, 1.0, [long]), _prospect("stiffness", ("current",), 2, 1.0, [other])]
+    assert grammar._shares(screen, offered)["stiffness", "energy"] > 0.8
 
 
 @pytest.mark.parametrize(
@@ -349,7 +357,7 @@ def test_of_two_fits_the_shorter_description_is_taken_and_what_does_not_matter_i
     def fitted(each):
         return SimpleNamespace(
             left_out=lambda *_, **__: np.full(40, each), counted=lambda _: 40, residual={channel: np.ones(40)},
-            bench=SimpleNamespace(episodes=40, means=lambda *_: SimpleNamespace(told=np.ones(40))),
+            bench=SimpleNamespace(episodes=40, means=lambda *_: Averaging(np.arange(40), 1)),
         )  # fmt: skip
 
     bare = SimpleNamespace(model=fitted(100.0), screening=SimpleNamespace(floor=lambda *_, **__: 2.0))
@@ -360,6 +368,12 @@ def test_of_two_fits_the_shorter_description_is_taken_and_what_does_not_matter_i
     assert np.argmin(grammar._lengths_fitted(bare, channel, pairs, np.ones((1, 40)))) == first
 
 
+def test_where_noise_is_estimated_as_more_than_is_left_the_fit_that_leaves_less_is_still_better():
+    squared = np.array([[100.0, 50.0], [70.0, 90.0]])
+    beyond = grammar._beyond(squared, np.array([120.0, 20.0]), 4.0)
+    assert beyond.tolist() == [[30.0, 30.0], [4.0, 70.0]]
+
+
 def test_a_gate_and_a_second_signal_lengthen_every_description(coupled):
     """Those of a term that is in use as those of one that is asked for."""
     selection = coupled[0]
@@ -367,11 +381,11 @@ def test_a_gate_and_a_second_signal_lengthen_every_description(coupled):
     [term] = bench.calibration.terms
     long = msgspec.structs.replace(term, gate="load", other="disc_speed", other_high=50.0)
     model = dataclasses.replace(selection.model, bench=bench.under(msgspec.structs.replace(bench.calibration, terms=(long,))))
-    more = grammar._description(dataclasses.replace(selection, model=model), "stiffness")
+    longer, as_long = grammar._descriptions([dataclasses.replace(selection, model=model), selection], "stiffness")
     numbers = (term.gate == "always") + 2 * (term.other is None)
     assert numbers >= 2
     expected = 0.5 * numbers * np.log(bench.episodes)
-    assert more - grammar._description(selection, "stiffness") == pytest.approx(expected)
+    assert longer - as_long == pytest.approx(expected)
 
 
 def test_of_equal_gains_what_most_resampled_episodes_choose_is_named_and_what_some_choose_is_said():
@@ -547,7 +561,7 @@ def test_only_of_a_brake_a_term_must_shorten_the_description(monkeypatch, clamps
     """Where nothing is clamped, terms that lengthen it hold on other recordings."""
     bench = SimpleNamespace(clamps=clamps)
     bare, found = (SimpleNamespace(model=SimpleNamespace(bench=bench), accepted=names) for names in ([], ["term"]))
-    monkeypatch.setattr(grammar, "_description", lambda selection, channel: float(len(selection.accepted)))
+    monkeypatch.setattr(grammar, "_descriptions", lambda both, channel: [float(len(each.accepted)) for each in both])
     assert grammar._is_longer(found, bare, "torque") == clamps and not grammar._is_longer(bare, found, "torque")
 
 

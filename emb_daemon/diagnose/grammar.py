@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
-from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model
+from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, noise_left
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
@@ -28,7 +28,6 @@ from emb_daemon.diagnose.prospects import (
     Search,
     coordinate_of,
     description_length,
-    noise_left,
     with_term,
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
@@ -108,10 +107,10 @@ def _restated(found: Selection, before: Selection, channel: str) -> Selection:
         # of the new shape does not undo that.
         refused = replace(candidate, accepted=False, reason="its shape was chosen again")
         bare = replace(before.noted([refused]), model=before.model.without(before.model.of_effect(name)))
-        found = min([*_in_shapes(bare, candidate, channel), found], key=lambda s: _description(s, channel))
+        found = _shortest([*_in_shapes(bare, candidate, channel), found], channel)
         if found is last:
             further = _in_shapes(before, candidate, channel, _SHAPES)
-            found = min([*further, found], key=lambda s: _description(s, channel))
+            found = _shortest([*further, found], channel)
     return found
 
 
@@ -186,7 +185,7 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     matters = gain > found.screening.floor(found.model, channel, made=True) ** 2
     fewer = len(_causes(both, channel)) < len(_causes(found, channel))
     fewer = fewer and len(_made(both, channel)) <= len(_made(found, channel))
-    return both if (matters or fewer) and _description(both, channel) < _description(found, channel) else found
+    return both if (matters or fewer) and _is_shorter(both, found, channel) else found
 
 
 def _with_hidden(found: Selection, catalogue: Selection, channel: str) -> Selection:
@@ -199,7 +198,7 @@ def _with_hidden(found: Selection, catalogue: Selection, channel: str) -> Select
         asked = replace(one_round(replace(found, dropped=found.dropped | others)), dropped=found.dropped)
         if asked.accepted == found.accepted:
             return asked
-        if _description(asked, channel) >= _description(found, channel):
+        if not _is_shorter(asked, found, channel):
             break
         found = asked
     return found
@@ -219,7 +218,7 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
             known = replace(known, names=term, p_value=proven.p_value, q_value=proven.q_value)
             named = bare.entered([known])
             named = replace(named, model=named.model.arrived(channel))
-            if known.effect.name in named.accepted and _description(named, channel) <= _description(selection, channel):
+            if known.effect.name in named.accepted and not _is_shorter(selection, named, channel):
                 selection = named
                 break
     return selection
@@ -230,17 +229,35 @@ def _place(made: Candidate) -> tuple[str, ...]:
     return made.effect.hook, *made.signals
 
 
-def _description(selection: Selection, channel: str) -> float:
+def _descriptions(selections: Sequence[Selection], channel: str) -> list[float]:
     """Description length of what lasts of a channel's residual, with all numbers of its effects and terms, and what each is:
-    the name of an effect is one of as many as places of a term, and further shapes of one place have said theirs."""
-    model, samples = selection.model, LASTING[channel]
-    left = float(np.square(Screen(model, channel, samples).residual).sum()) - noise_left(model, channel, samples)
-    matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
-    numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
-    numbers += sum(further_numbers(term) for term in model.bench.calibration.terms if term.name in _made(selection, channel))
-    ports = [port for port in PORTS if model.bench.channel_of(HOOKS[port].channel) == channel]
-    named = len(_causes(selection, channel)) * np.log(places(ports))
-    return description_length(max(left, matters), numbers, model.bench.episodes) + named
+    the name of an effect is one of as many as places of a term, and further shapes of one place have said theirs. Lengths can
+    be compared with those of the same call."""
+    samples, models = LASTING[channel], [selection.model for selection in selections]
+    squared = np.array([float(np.square(Screen(model, channel, samples).residual).sum()) for model in models])
+    noise = min(float(noise_left(model, channel, samples).sum()) for model in models)
+    screening = selections[0].screening
+    matters = min(model.counted(channel) * screening.floor(model, channel, made=True) ** 2 for model in models)
+    left = _beyond(squared, np.array(noise), matters)
+    ports = [port for port in PORTS if models[0].bench.channel_of(HOOKS[port].channel) == channel]
+    lengths = []
+    for selection, rest in zip(selections, left, strict=True):
+        model, made = selection.model, _made(selection, channel)
+        numbers = sum(bool(coordinate.effect) for coordinate in model.own(channel))
+        numbers += sum(further_numbers(term) for term in model.bench.calibration.terms if term.name in made)
+        named = len(_causes(selection, channel)) * np.log(places(ports))
+        lengths.append(float(description_length(rest, numbers, model.bench.episodes) + named))
+    return lengths
+
+
+def _shortest(selections: Sequence[Selection], channel: str) -> Selection:
+    return selections[int(np.argmin(_descriptions(selections, channel)))]
+
+
+def _is_shorter(one: Selection, other: Selection, channel: str) -> bool:
+    """Whether ``one`` describes a channel more shortly than the ``other``."""
+    lengths = _descriptions((one, other), channel)
+    return lengths[0] < lengths[1]
 
 
 def _causes(selection: Selection, channel: str) -> set[tuple[str, ...]]:
@@ -253,7 +270,7 @@ def _wanted(selection: Selection, channel: str) -> bool:
     """Whether the lasting residual is large enough for a term to be looked for."""
     model, floor = selection.model, selection.screening.floor(selection.model, channel, made=True)
     if channel == CHANNEL_OF_HEAT:
-        left = float(np.square(Screen(model, channel, 1).residual).sum()) - noise_left(model, channel, 1)
+        left = float(np.square(Screen(model, channel, 1).residual).sum()) - float(noise_left(model, channel, 1).sum())
         return bool(left >= model.counted(channel) * floor**2)
     screen = Screen(model, channel, COARSE)
     return rmse(screen.residual[:, 0] * screen.means.per_mean) >= floor
@@ -317,7 +334,7 @@ def _is_longer(found: Selection, selection: Selection, channel: str) -> bool:
 
     Not asked of machines that clamp nothing: by this rule five of 36 recordings lost a term that holds on other logs."""
     clamps = selection.model.bench.clamps
-    return clamps and _description(found, channel) > _description(selection, channel)
+    return clamps and _is_shorter(selection, found, channel)
 
 
 def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
@@ -467,9 +484,11 @@ def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, st
     scores = [screen.scores(np.column_stack(prospect.columns)) for prospect in prospects]
     weights = _resampled(scores[0].u.shape[1])
     gains = np.array([np.sum((weights @ s.u.T) ** 2 / np.maximum(weights @ s.a.T, 1e-300), axis=1) for s in scores])
-    alone = weights @ np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, weights.shape[1])
-    alone -= noise_left(screen.model, screen.channel, LASTING[screen.channel])
-    return _chosen(prospects, _lengths(prospects, 1.0 - gains / np.maximum(alone, NOTHING), weights.shape[1]))
+    alone = np.bincount(screen.means.episode, screen.residual[:, 0] ** 2, weights.shape[1])
+    noise = weights @ noise_left(screen.model, screen.channel, LASTING[screen.channel])
+    # The noise is an estimate, which may be more than the best prospect leaves: all would leave nothing.
+    alone = np.maximum(weights @ alone - noise, gains.max(axis=0) + np.maximum(noise * screen.noise_scatter, NOTHING))
+    return _chosen(prospects, _lengths(prospects, 1.0 - gains / alone, weights.shape[1]))
 
 
 def _shares_fitted(
@@ -487,12 +506,18 @@ def _lengths_fitted(
     ``selection``: without any of them. What is too little to matter is nothing; not of heat, where what leaves least is taken.
     """
     model, samples = selection.model, LASTING[channel]
-    noise, matters = noise_left(model, channel, samples), NOTHING
+    noise, matters = weights @ noise_left(model, channel, samples), NOTHING
     if channel != CHANNEL_OF_HEAT:
         matters = model.counted(channel) * selection.screening.floor(model, channel, made=True) ** 2
-    alone, *left = (m.left_out(channel, samples=samples) for m in (model, *(found.model for _, found in fitted)))
-    share = np.maximum(np.array(left) @ weights.T - noise, matters) / np.maximum(weights @ alone - noise, matters)
-    return _lengths([prospect for prospect, _ in fitted], share, len(alone))
+    models = model, *(found.model for _, found in fitted)
+    alone, *left = _beyond(np.array([m.left_out(channel, samples=samples) for m in models]) @ weights.T, noise, matters)
+    return _lengths([prospect for prospect, _ in fitted], np.array(left) / alone, model.bench.episodes)
+
+
+def _beyond(squared: np.ndarray, noise: np.ndarray, matters: float) -> np.ndarray:
+    """Squared errors of several fits, one row each, beyond their ``noise``. This is an estimate: where a fit leaves less, the
+    noise is no more than that, or all that leave as little would be as good as each other. What does not matter is nothing."""
+    return np.maximum(squared - np.minimum(noise, squared.min(axis=0)), matters)
 
 
 def _resampled(episodes: int) -> np.ndarray:

@@ -8,7 +8,8 @@ import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
 from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out, leave_out_within
-from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, Bench, Probe
+from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, SIDE_BY_SIDE, Bench, Probe
+from emb_daemon.diagnose.unexplained import noise_of_means
 from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 
@@ -337,3 +338,12 @@ def is_shape(coordinate: Coordinate) -> bool:
     if coordinate.name.startswith("terms["):
         return coordinate.parameter not in ("coefficient", "sine")
     return coordinate.name in _SHAPES
+
+
+def noise_left(model: Model, channel: str, samples: int) -> np.ndarray:
+    """Squared error of each episode that no term explains, of means over ``samples``, shape (episodes,)."""
+    means = model.bench.means(channel, samples)
+    told = model.residual[channel] * means.told
+    # Each mean has the same variance, of however few samples it is, because it is weighted by their number.
+    counted = np.bincount(means.episode, means.of(told[:, None])[:, 0] != 0.0, model.bench.episodes)
+    return counted * noise_of_means(told, samples, SIDE_BY_SIDE.get(channel, 1))

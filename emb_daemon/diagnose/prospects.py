@@ -14,12 +14,11 @@ from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.diagnose.coordinates import Coordinate, Move
 from emb_daemon.diagnose.evidence import Averaging, Evidence
 from emb_daemon.diagnose.forms import FORMED, Form, enumerate_forms, enumerate_products, harmonic, rippling
-from emb_daemon.diagnose.model import LASTING, Model
+from emb_daemon.diagnose.model import LASTING, Model, noise_left
 from emb_daemon.diagnose.orders import strongest_orders
-from emb_daemon.diagnose.residuals import SIDE_BY_SIDE, Bench, Probe
+from emb_daemon.diagnose.residuals import Bench, Probe
 from emb_daemon.diagnose.selection import NOT_OF_A_FREE_MOTOR
 from emb_daemon.diagnose.signals import OF_A_BRAKE
-from emb_daemon.diagnose.unexplained import sample_noise
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
 from emb_daemon.effects.terms import PARAMETERS, PORTS, SIGNALS, evaluate
 from emb_daemon.errors import InvalidValue
@@ -85,6 +84,11 @@ class Screen:
         self._inverse = np.linalg.pinv(self.nuisances.T @ self.nuisances + np.diag(penalty), rcond=1e-12, hermitian=True)
         self.residual: np.ndarray = self.beside_nuisances(averaged[:, -1:])
         self.keep: np.ndarray = model.residual[channel] != 0.0
+
+    @property
+    def noise_scatter(self) -> float:
+        """Relative standard deviation of the squared error that noise leaves."""
+        return float(np.sqrt(2.0 / max(np.count_nonzero(self.means.per_mean), 1)))
 
     def beside_nuisances(self, averaged: np.ndarray) -> np.ndarray:
         """What of averaged columns the nuisances cannot take."""
@@ -192,12 +196,14 @@ class Search:
         """The best forms, through the estimator, with their sizes fitted; shortest description first. Of two signals only
         where one leaves more than ``floor`` (RMS, in the channel's unit) that lasts, and if the best is one of them."""
         model, samples = self.model, LASTING[self.channel]
-        alone = float(model.left_out(self.channel, samples=samples).sum())
-        alone -= noise_left(model, self.channel, samples)
+        noise = float(noise_left(model, self.channel, samples).sum())
+        alone, least = float(model.left_out(self.channel, samples=samples).sum()) - noise, noise * self.screen.noise_scatter
 
         def shortest(found: Sequence[Prospect]) -> list[Prospect]:
             kept = [p for p in found if p.evidence.gain > 0.0 and _stays_in_bounds(p) and self.is_within(_term_of(p))]
-            return sorted(kept, key=lambda p: _length(p, alone, model.bench.episodes))
+            # The noise is an estimate, which may be more than the best leaves: all would leave nothing.
+            most = max((p.evidence.gain for p in kept), default=0.0)
+            return sorted(kept, key=lambda p: _length(p, max(alone, most + least), model.bench.episodes))
 
         single = shortest([*self._run(_sharpen(self, self.forms, self.gains)), *self.ripples()])
         most = max((p.evidence.gain for p in single), default=0.0)
@@ -479,10 +485,3 @@ def description_length(left: Any, numbers: Any, episodes: int) -> Any:
     """Description length of a squared error and the numbers of what left it, or of arrays of these; an episode counts as one
     observation."""
     return 0.5 * episodes * np.log(left) + 0.5 * numbers * np.log(episodes)
-
-
-def noise_left(model: Model, channel: str, samples: int) -> float:
-    """Squared error that no term explains, of means over ``samples``."""
-    residual = model.residual[channel]
-    counted = np.count_nonzero(residual * model.bench.means(channel, samples).told)
-    return counted * sample_noise(residual, SIDE_BY_SIDE.get(channel, 1)) ** 2 / samples

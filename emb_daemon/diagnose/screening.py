@@ -36,9 +36,9 @@ Q_VALUE = 0.01
 #: A gain matters from this share of the channel's residual, or of what lasts of it where that is less, and from this share of
 #: the RMS of what is measured: force sensors of test rigs are good for two parts in a thousand, and thermocouples of what they
 #: have risen by (IEC 60584, class 1: 0.4 % are two standard deviations). On simulated brakes with nothing hidden the best of
-#: all forms gains 0.07 to 0.12 of what lasts (four drives), and the best effect of the catalogue that chance does not explain
-#: 0.11 (twelve).
-_RESIDUAL_SHARE, _LASTING_SHARE, _SIGNAL_SHARE = 0.06, 0.2, 0.002
+#: all forms gains 0.05 to 0.12 of what lasts (ten drives), and the best effect of the catalogue that chance does not explain
+#: 0.11 (twelve). A term of a brake has to be above chance over the whole grammar as well, and needs less.
+_RESIDUAL_SHARE, _LASTING_SHARE, _OF_A_TERM, _SIGNAL_SHARE = 0.06, 0.2, 0.15, 0.002
 #: Samples in the shortest means, which leave out where friction turns over. How friction turns over is modelled roughly; where
 #: it turns over late it looks like a friction that rises with speed.
 SLIDING = 2
@@ -138,7 +138,9 @@ class Screening:
         if channel == "temperature" and not made:
             return _FLOOR_K
         share = _TORQUE_SHARE if channel == "brake_torque" else _SIGNAL_SHARE
-        lasting = _LASTING_SHARE * np.sqrt(model.lasting(channel, LASTING[channel]))
+        term = made and channel in FORCE_CHANNELS and model.bench.clamps
+        of_lasting = _OF_A_TERM if term else _LASTING_SHARE
+        lasting = of_lasting * np.sqrt(model.lasting(channel, LASTING[channel]))
         left = min(_RESIDUAL_SHARE * np.sqrt(model.noise(channel)), lasting)
         return float(max(left, share * self._size[channel]))
 

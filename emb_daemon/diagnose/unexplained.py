@@ -16,6 +16,9 @@ _LEAST_SHARE = 0.05
 #: from log to log and pad to pad, units by less. A dependence that adds less to what noise leaves of the means it is seen in
 #: is within that scatter.
 CLEARLY, _SCATTER = 1.5, 1.25
+#: Part of a mean's time after which noise has forgotten itself: current sensors average over some milliseconds, torque is held
+#: against terms as means over an eighth of a second.
+_FORGOTTEN = 4
 #: Heat without a brake torque sensor is as uncertain as pads' friction, which no table knows better from one day to the next.
 _FRICTION_SHARE = 0.08
 
@@ -110,6 +113,20 @@ def sample_noise(residual: np.ndarray, places: int = 1) -> float:
     """RMS of what of a residual differs from sample to sample, each of so many ``places``; zero means none."""
     later, earlier = residual[places:], residual[:-places]
     return float(np.sqrt(0.5)) * rmse((later - earlier)[(later != 0.0) & (earlier != 0.0)])
+
+
+def noise_of_means(residual: np.ndarray, samples: int, places: int = 1) -> float:
+    """Variance of white noise that would leave as much of means over ``samples`` as the noise of a residual does, each sample
+    of so many ``places``; zero means none.
+
+    Noise is what a residual has forgotten after a part of that time (`_FORGOTTEN`): a sensor filters, and neighbouring samples
+    of its noise are alike. Its autocovariance comes from differences (structure function), without what is slower."""
+    longest = max(samples // _FORGOTTEN, 1)
+    apart = np.array([0.0, *(sample_noise(residual, places * lag) ** 2 for lag in range(1, longest + 1))])
+    covariance = apart[-1] - apart[:-1]
+    weights = 2.0 * (1.0 - np.arange(longest) / samples)
+    weights[0] = 1.0
+    return max(float(weights @ covariance), 0.0)
 
 
 def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K: np.ndarray, samples: int = 1) -> float:
