@@ -232,17 +232,22 @@ def test_bench_runs_the_production_estimator(calibration):
     np.testing.assert_array_equal(bench.residuals({})["stiffness"], np.nan_to_num(expected))
 
 
-@pytest.mark.parametrize("moved_rad", [0.0, -64.0])
-def test_with_heat_held_the_paths_are_those_of_the_step(calibration, moved_rad):
+@pytest.mark.parametrize(("moved_rad", "count"), [(0.0, None), (-64.0, None), (-64.0, 3)])
+def test_with_heat_held_the_paths_are_those_of_the_step(calibration, moved_rad, count):
     """What a fit's derivatives run is the estimator to the last bit, and moves with a parameter as the whole step does. Where
-    the resolver loses its zero the contact is learned anew with a slope that is a mean, by some hundredths of a newton."""
+    the resolver loses its zero the contact is learned anew with a slope that is a mean, by some hundredths of a newton. Where
+    it comes back after some messages friction is what it was before."""
     samples = log_of(next(drives(calibration, 61, {}, stops=2))).samples
-    samples["angle"][len(samples) // 2 :] += moved_rad
+    begin = len(samples) // 2
+    wrong = slice(begin, None if count is None else begin + count)
+    samples["angle"][wrong] += moved_rad
+    samples["speed"][wrong] += 20.0 * (count is not None)
     p = held(to_parameters(calibration))[0]
     stiffer = p.copy()
     stiffer["curve"] *= 1.01
     whole, heat = run_with_heat(samples, p)
-    assert np.count_nonzero(heat["zero_moved"]) == (moved_rad != 0.0)
+    assert np.count_nonzero(heat["zero_moved"][begin]) == (moved_rad != 0.0)
+    assert np.count_nonzero(heat["came_back"]) == (count is not None)
     fast = run_held(samples, p, heat)
     for name in ("force", "torque", "leverage", "torque_constant"):
         np.testing.assert_allclose(fast[name], whole[name], rtol=1e-5 if moved_rad else 0.0)

@@ -11,6 +11,7 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.effects.terms import SIGNALS
 from emb_daemon.estimator.paths import rest, shift_zero, stiffness_path, torque_path
 from emb_daemon.estimator.records import STATE
+from emb_daemon.estimator.resolver import remember_motion, restore_motion
 from emb_daemon.jit import njit
 from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline.run import HEAT, TRACE, run_step
@@ -32,7 +33,11 @@ def _run(samples, parameters, states, heat, out, signals):
         s.pads[0, 0], s.pads[1, 0] = h.surface[0], h.surface[1]
         s.winding, s.housing = h.winding, h.housing
         if h.zero_moved != 0.0:
+            if h.may_come_back and not (row > 0 and heat[row - 1].may_come_back):
+                remember_motion(s)
             shift_zero(s, h.zero_moved)
+            if h.came_back:
+                restore_motion(s)
         rise = 0.5 * (h.mean[0] + h.mean[1]) - p.thermal.reference
         stiffness_path(s, p, m, stiffness_factor(p.thermal, rise, h.history) if h.temperature_known else 1.0)
         if len(signals) > 0:
@@ -42,7 +47,7 @@ def _run(samples, parameters, states, heat, out, signals):
         s.force -= s.slope * h.contact_moved
         o.force = s.force
         o.torque, o.leverage, _ = torque_path(s, p, m)
-        if h.zero_moved != 0.0:
+        if h.zero_moved != 0.0 or h.may_come_back:
             o.torque = np.nan
         factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
         o.torque_constant = p.torque_constant * factor

@@ -44,8 +44,9 @@ _ZERO_RAD = 0.1
 #: Standard deviations of the speed's noise that are certain; and time after which a zero that drifted counts as healed, s: a
 #: car that stands once in a minute shows it.
 _CERTAIN, _DRIFTING_S = 6.0, 60.0
-#: Time within which a zero that comes back had never moved, s: some messages; and standard deviations that tell both.
-_AWAY_S, _SURELY = 0.05, 3.0
+#: Time within which a zero that comes back had never moved, s: some messages; time of one that has not moved; and standard
+#: deviations that tell both.
+_AWAY_S, LONG_AGO_S, _SURELY = 0.05, 1e9, 3.0
 #: From one standstill to the next angle and integrated speed must agree, whatever their delay. A standstill must last for
 #: twice the longest delay that a calibration may state, s.
 _AT_REST_S = 0.1
@@ -215,12 +216,12 @@ def _move_zero(s, p, moved, sigma, back):
     ``back``: to where it was."""
     a = s.away
     if not may_come_back(s):
-        _remember_motion(s)
+        _remember(s)
     went = a.way
     a.way += moved
     a.variance += sq(sigma)
     if back or abs(a.way) < _SURELY * sqrt(a.variance) < abs(went):
-        _restore_motion(s, went)
+        _restore(s, went)
         return
     s.drifted = s.stood_s = 0.0
     s.strayed = np.nan
@@ -237,35 +238,54 @@ def may_come_back(s: Record) -> bool:
 
 
 @njit
-def _remember_motion(s):
+def came_back(s: Record) -> bool:
+    """Whether it did so in this sample."""
+    return s.away.seconds == LONG_AGO_S
+
+
+@njit
+def remember_motion(s: Record) -> None:
+    """Keep where motor and friction are before the zero moves."""
+    a = s.away
+    a.angle, a.speed, a.slid = s.angle, s.speed, s.slid_angle
+    a.friction, a.friction_variance = s.friction_state, s.friction_variance
+
+
+@njit
+def restore_motion(s: Record) -> None:
+    """Motor and friction are where they were: some messages were wrong, and nothing has moved as they said."""
+    a = s.away
+    s.angle, s.speed, s.slid_angle = a.angle, a.speed, a.slid
+    s.friction_state, s.friction_variance = a.friction, a.friction_variance
+
+
+@njit
+def _remember(s):
     """Keep what is believed before the zero moves."""
     a = s.away
     a.way = a.variance = a.seconds = 0.0
     a.known, a.confirmed = s.covariance[CONTACT, CONTACT], s.contact.confirmed
     a.believed = s.drifting_s == 0.0 and s.plausibility.verdict == AGREE
-    a.angle, a.speed, a.slid = s.angle, s.speed, s.slid_angle
-    a.friction, a.friction_variance = s.friction_state, s.friction_variance
     a.strayed, a.turned, a.stood = s.strayed, s.turned, s.stood_s
+    remember_motion(s)
 
 
 @njit
-def _restore_motion(s, went):
-    """Some messages were wrong: the zero, which they moved by ``went`` rad, is where it was, and the motor has not turned
-    friction over as they said."""
+def _restore(s, went):
+    """The zero, which wrong messages have moved by ``went`` rad, is where it was, and so is what is believed."""
     a, before = s.away, s.covariance[CONTACT, CONTACT]
     shift_zero(s, -went)
     known = sqrt(a.known / before) if before > a.known else 1.0
     for i in range(STATES):
         s.covariance[CONTACT, i] *= known
         s.covariance[i, CONTACT] *= known
-    s.angle, s.speed, s.slid_angle = a.angle, a.speed, a.slid
-    s.friction_state, s.friction_variance = a.friction, a.friction_variance
+    restore_motion(s)
     s.strayed, s.turned, s.stood_s = a.strayed, a.turned, a.stood
     s.contact.confirmed = a.confirmed
     if a.believed:
         s.drifting_s = 0.0
         believe_resolver(s.plausibility)
-    a.seconds = 1e9
+    a.seconds = LONG_AGO_S
 
 
 @njit

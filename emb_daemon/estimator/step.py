@@ -17,7 +17,15 @@ from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
 from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_friction, doubt_memory, stiffness_path, torque_path
-from emb_daemon.estimator.resolver import MOST_SLIP_RAD, SPEED_MARGIN, at_rest, believe_speed, follow_zero, may_come_back
+from emb_daemon.estimator.resolver import (
+    LONG_AGO_S,
+    MOST_SLIP_RAD,
+    SPEED_MARGIN,
+    at_rest,
+    believe_speed,
+    follow_zero,
+    may_come_back,
+)
 from emb_daemon.estimator.rewind import forget_stroke, go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
@@ -100,7 +108,8 @@ def _start(s, p, m):
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
-    s.torque_age = s.no_current_s = s.away.seconds = 1e9
+    s.torque_age = s.no_current_s = 1e9
+    s.away.seconds = LONG_AGO_S
     open_all(s, p)
     forget_common(s)
     if s.resumed:

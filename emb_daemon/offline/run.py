@@ -16,6 +16,7 @@ from emb_daemon.effects import paths as effects
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.paths import settle_paths, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, STATE, new_state
+from emb_daemon.estimator.resolver import came_back, may_come_back
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import fields, njit
 
@@ -37,13 +38,14 @@ TRACE = np.dtype(
 #: What the force paths take from the rest of the step, at each sample: temperatures (degC) of the pads, ``mean`` and at the
 #: ``surface``, and the ``history`` of their rise (K), friction ``power`` (W), ``disc`` (degC), whether temperatures are known,
 #: the heat of the motor's winding and housing. Angles (rad) by which the resolver's zero was found to have moved
-#: (``zero_moved``), and the contact angle beside it, which is learned anew from then on (``contact_moved``).
+#: (``zero_moved``), and the contact angle beside it, which is learned anew from then on (``contact_moved``); whether it
+#: ``may_come_back``, so that no torque is used, and whether it ``came_back``.
 HEAT = np.dtype(
     [
         ("mean", "f8", (2,)),
         ("surface", "f8", (2,)),
         *fields("f8", "history power disc winding housing zero_moved contact_moved"),
-        ("temperature_known", "?"),
+        *fields("?", "temperature_known may_come_back came_back"),
     ],
     align=True,
 )
@@ -107,6 +109,7 @@ def _run_step(samples, parameters, states, estimate, out, heat):
             h.surface[0], h.surface[1] = s.pads[0, 0], s.pads[1, 0]
             h.history, h.zero_moved = s.history, s.gear_zero - zero
             h.contact_moved = s.contact_angle - contact - h.zero_moved
+            h.may_come_back, h.came_back = may_come_back(s), h.zero_moved != 0.0 and came_back(s)
             h.power, h.disc, h.temperature_known = s.power, s.disc, s.temperature_known
         factor = effects.torque_constant(p.effects, s.effects, m, s.disc, s.temperature_known, 0.0)
         o.torque_constant = p.torque_constant * factor
