@@ -140,7 +140,7 @@ def test_samples_that_no_motor_turns_to_leave_nothing_behind(begin, angle_rad, s
     assert estimates["sigma"][-1] < 2.0 * good["sigma"][-1]
 
 
-@pytest.mark.parametrize("begin", [800, 1900])
+@pytest.mark.parametrize("begin", [800, 1368, 1900])
 @pytest.mark.parametrize(
     ("angle_rad", "speed_rad_per_s", "count"),
     [(0.2, 0.0, 1), (0.12, 0.0, 1), (-0.11, 0.0, 2), (0.51, -46.0, 3), (0.7, 46.0, 2), (84.0, 140.0, 1), (11.0, 50.0, 3)],
@@ -153,8 +153,10 @@ def test_wrong_messages_at_rest_turn_no_friction_over(begin, angle_rad, speed_ra
     good, state, end = new_state(), new_state(), begin + count + 1
     for each in (good, state):
         estimate(samples[:begin], p, each)
-        # What the clearance had shown would now pass for a clamp.
-        each["contact"]["level"], each["contact"]["samples"] = -0.15, 300.0
+        # What torque the clearance seems to have needed would pass for a clamp, were the contact not confirmed.
+        if each["contact"]["confirmed"]:
+            for name, value in (("level", -0.4), ("samples", 300.0), ("excess", 0.4), ("watched", 15.0)):
+                each["contact"][name] = value
     estimate(samples[begin:end], p, good)
     samples["angle"][begin : begin + count] += angle_rad
     samples["speed"][begin : begin + count] += speed_rad_per_s
@@ -165,6 +167,16 @@ def test_wrong_messages_at_rest_turn_no_friction_over(begin, angle_rad, speed_ra
     assert state["contact"]["confirmed"][0] == good["contact"]["confirmed"][0]
     if abs(angle_rad) > 1.0:
         assert np.all(np.isnan(estimates["innovation"]))
+
+
+@pytest.mark.parametrize(("since_s", "wrong"), [(0.004, False), (1.0, True)])
+def test_a_speed_that_is_again_what_it_was_before_a_wrong_message_is_believed(since_s, wrong):
+    """The message's own had just been possible, and to come back from it is not."""
+    p, s, m = to_parameters(shipped_calibration()), new_state()[0], city.drive()[0][:1].copy()[0]
+    s["angle"], s["speed"], s["away"]["seconds"] = m["angle"] + 84.0, 0.499 * p["maximum_speed"], since_s
+    m["dt"], m["speed"] = 0.004, -0.3
+    resolver.believe_speed(s, p, m)
+    assert s["speed_wrong"] == wrong and (m["speed"] == -0.3) != wrong
 
 
 @pytest.mark.parametrize(("samples_away", "known"), [(5, True), (100, False)])

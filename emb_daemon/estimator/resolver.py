@@ -99,7 +99,7 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     frozen_s = s.plausibility.frozen_s if s.drifting_s == 0.0 else 0.0
     stuck = s.plausibility.still > 1 or frozen_s > 0.0
     reach = p.maximum_speed * (m.dt + max(frozen_s, CYCLE_S * s.plausibility.still))
-    moved, sigma, back = 0.0, 0.0, False
+    moved, sigma, back, drifts = 0.0, 0.0, False, False
     seen = 0.0 < m.dt <= ONE_CYCLE_S and not stuck
     slip = jump - turned
     # A speed that was late is as far off as one that went through the filter that is undone in its place.
@@ -128,14 +128,12 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
         # What has just moved it by little more than counts comes back by little less.
         moved, sigma, back = slip, limit / _SURELY, True
     elif seen:
-        if stands and abs(slip) > _LEAST_SLIP_RAD:
-            # Nothing has turned that was at rest and does not show a speed: this slides no gear.
-            s.slid_angle += slip
         _know_slips(s, m, stands, abs(slip) - by_delay)
         moved = _drift(s, m, slip, turned)
-        if moved != 0.0:
-            sigma = abs(moved)
-            s.drifting_s = _DRIFTING_S
+        sigma, drifts = abs(moved), moved != 0.0
+        if not drifts and stands and abs(slip) > _LEAST_SLIP_RAD:
+            # Nothing has turned that was at rest and does not show a speed: this slides no gear.
+            s.slid_angle += slip
     s.drifting_s = max(s.drifting_s - m.dt, 0.0)
     if not seen:
         # A motion that was not observed completely cannot be checked at its end.
@@ -143,6 +141,8 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     s.away.seconds += m.dt
     if moved != 0.0:
         _move_zero(s, p, moved, sigma, back)
+    if drifts:
+        s.drifting_s = _DRIFTING_S
     return moved != 0.0
 
 
