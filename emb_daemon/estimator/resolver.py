@@ -61,7 +61,8 @@ _SPEED_GAIN = 0.02
 #: Samples in a row in which angle and speed repeat to the bit, from which both are stale: by chance, at one repetition in five
 #: of a motor that stands, one in a hundred.
 _REPEATED = 3
-#: Time for which a loose contact repeats an angle, s.
+#: Time after which an angle that repeats beside a speed of no more than `LARGEST_OFFSET` stands, s. Until then it may be a
+#: loose contact, and is behind by no more than six tenths of a radian.
 _BEHIND_S = 0.1
 
 
@@ -111,7 +112,7 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     # Before it has stood for so long, an angle that is late may still be turning.
     stands = int(s.stood_s > _AT_REST_S and abs(m.speed) < STANDING_RAD_PER_S)
     limit = _BEYOND_SLIPS * min(max(s.largest_slip[stands], _LEAST_SLIP_RAD), MOST_SLIP_RAD)
-    # What repeats for longer than a loose contact does, beside a low speed, stands, and the speed has an offset.
+    # An angle that repeats for long beside a low speed stands, and the speed has an offset.
     behind = s.behind if s.behind_s < _BEHIND_S or abs(s.behind) > LARGEST_OFFSET * s.behind_s else 0.0
     _stay_behind(s, m, jump, turned)
     # A loose contact repeats an angle, which is right again when it has made up for the way; one that is late by a cycle
