@@ -132,8 +132,9 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
         _know_slips(s, m, stands, abs(slip) - by_delay)
         moved = _drift(s, m, slip, turned)
         sigma, drifts = abs(moved), moved != 0.0
-        if not drifts and stands and abs(slip) > _LEAST_SLIP_RAD:
-            # Nothing has turned that was at rest and does not show a speed: this slides no gear.
+        if not drifts and stands and abs(slip) > _LEAST_SLIP_RAD and p.clearance_sigma > 0.0:
+            # Nothing has turned that was at rest and does not show a speed: this slides no gear. Where the brake is held as
+            # exactly known, paths are compared with those of `diagnose.held_heat`, whose friction follows the angle.
             s.slid_angle += slip
     s.drifting_s = max(s.drifting_s - m.dt, 0.0)
     if not seen:
