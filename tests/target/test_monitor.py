@@ -49,7 +49,8 @@ def test_a_script_sees_what_the_daemon_says(daemon: subprocess.Popen[bytes], rig
     front_left = said[-1]["FL"]
     print(front_left)
     assert 0.0 <= front_left["clamp_force_kN"] < 20.0 and 0.0 < front_left["clamp_force_sigma_kN"] < 2.0
-    assert front_left["source"] in ("fused", "stiffness", "torque") and front_left["damaged"] == 0
-    # A guest with one CPU, shared with a program that starts: most of them, not all.
-    assert front_left["forces_per_s"] > 150.0
+    assert front_left["source"] in ("fused", "stiffness", "torque")
+    # A guest with one CPU, shared with a program that starts: most of them, not all. After a stall what was played meanwhile
+    # is estimated and sent in one burst; of a burst that is lost by a whole turn of the counter the next frame looks repeated.
+    assert front_left["forces_per_s"] > 150.0 and front_left["damaged"] < 0.01 * front_left["received"]
     assert said[-1]["RR"]["clamp_force_kN"] is None
