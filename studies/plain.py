@@ -18,6 +18,7 @@ from emb_daemon.calibration.files import load_calibration
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.diagnose.episodes import standing
 from emb_daemon.errors import InputError
+from emb_daemon.identify.steps.stiffness import cubic_of_each_way
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.offline import Log, load_log
@@ -68,10 +69,8 @@ def _over_motion(log, fastest):
 
 
 def _over_angle(log):
-    known, x = np.isfinite(log.force_N), log.samples["angle"]
-    cubic = np.vander(x, 4)
-    table = np.column_stack([cubic, np.sign(np.gradient(x))[:, None] * cubic])
-    return table[known], log.force_N[known]
+    known = np.isfinite(log.force_N)
+    return cubic_of_each_way(log.samples["angle"])[known], log.force_N[known]
 
 
 def main(argv: list[str] | None = None) -> int:

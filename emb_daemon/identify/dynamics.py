@@ -24,24 +24,24 @@ RELAXATION = "stiffness.relaxation_time_s"
 #: Delay of the rig's reference relative to its resolver, s; fitted together with the calibration's keys, but no property of
 #: the brake.
 DELAY = "reference delay"
-#: Optional effects on the static force, and further elements of each.
+#: Effects on the force that may be added to the dynamics, and those that are a further element beside another.
 _STATIC = tuple(effect for effect in REGISTRY if effect.hook in ("stiffness", "force"))
 OPTIONAL = tuple(effect for effect in _STATIC if not effect.beside)
 FURTHER = tuple(effect for effect in _STATIC if effect.beside)
-#: Starting values of these effects' shapes: time constants over the lag's, angles over the travel; of a second element, over
-#: the first's.
+#: Starting values of these effects' time constants over that of the lag, and of their angles over the travel; by unit, those
+#: of a further element over those of the first.
 _TIMES, _SHARE_OF_TRAVEL = 10.0, 0.05
 _MORE = {"s": 10.0, "rad": 0.25}
-#: Further starting values of those that are an angle, over the first, and number of evaluations after which they are compared.
+#: Further starting values of angles, over the first, and number of evaluations after which they are compared.
 _ANGLE_STARTS = (0.3, 3.0)
 _TRIAL = 8
-#: How far from where a fit to all logs puts it a log's contact is looked for in a fit to the others, over its travel.
+#: Share of a log's travel, to either side of the contact by a fit to all logs, in which a fit to the others looks for it.
 _CONTACT = 0.1
-#: Share of a log's largest force that is none: the zero of a force sensor is as sure as that.
+#: Share of a log's largest force below which the force is zero: the error of a force sensor's zero.
 _NO_FORCE = 0.01
-#: Samples of a log, and places in its travel, at which its contact is looked for before anything is fitted.
+#: Number of samples and of contact angles over which a log's contact is guessed before anything is fitted.
 _PLACES, _CONTACTS = 1000, 60
-#: Number of places in the travel at which a curve's slope is watched, and what it is at least, over the mean one.
+#: Number of places in the travel at which a curve has to rise, and its least slope there over the mean slope.
 _SLOPES, _LEAST_SLOPE = 200, 0.02
 #: Least lower bound of parameters that are searched as logarithms, in their own units.
 _LEAST = 1e-4
@@ -166,9 +166,13 @@ def simulate(log: Log, calibration: Calibration, thickness_mm: float, clearance:
 def path_errors(log: Log, calibration: Calibration, thickness_mm: float, clearance: float, delay_s: float = 0.0) -> Errors:
     """Errors of the stiffness path on a log. With ``delay_s`` 0 they are the daemon's, which knows nothing of the reference's
     delay."""
-    error = simulate(log, calibration, thickness_mm, clearance, delay_s) - log.force_N
-    known = np.isfinite(error)
-    return error[known], log.force_N[known]
+    return where_known(simulate(log, calibration, thickness_mm, clearance, delay_s) - log.force_N, log.force_N)
+
+
+def where_known(error: np.ndarray, force_N: np.ndarray) -> Errors:
+    """Errors at samples with a reference force, and that force."""
+    known = np.isfinite(force_N)
+    return error[known], force_N[known]
 
 
 def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, slow: bool = True) -> list[Errors]:
@@ -222,8 +226,8 @@ def is_slow(log: Log) -> bool:
 
 
 def clearance_guess(log: Log, travel: np.ndarray) -> float:
-    """The first ``travel`` (rad, at each sample) at which a log's reference force is clear of its noise, and from which it
-    rises: until a jaw touches, joints and seals may drag as much as they like, but alike."""
+    """The first ``travel`` (rad, at each sample) at which a log's reference force exceeds its noise, and from which it rises:
+    the drag of joints and seals before contact is a force, but a constant one."""
     clear = np.flatnonzero(log.force_N > 8.0 * max(_rest_noise(log), 1e-9))
     return max(float(travel[clear[0]]) if len(clear) else 0.0, _rises_from(log.force_N, travel))
 
@@ -300,7 +304,7 @@ def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[
         log = pads.logs[-1]
         x = _past_contact(log, calibration)
         if is_slow(log):
-            # From sample to sample its force hardly changes, and a regression over the last one is of noise.
+            # Its force hardly changes from sample to sample, so that a regression over the sample before fits noise.
             known, span = np.isfinite(log.force_N), float(x.max()) ** np.arange(1, TERMS + 1)
             coefficients = nnls(powers(x[known]) / span, log.force_N[known])[0] / span
         elif (coefficients := regress_free(log, x)[0])[0] <= 0.0:
@@ -320,7 +324,7 @@ def _scale(pads: Pads, calibration: Calibration) -> np.ndarray:
 
 
 def _free(calibration: Calibration, key: str) -> Free:
-    """Positive parameters are searched as logarithms; otherwise the slip angle can become negative and stay so."""
+    """Positive parameters are searched as logarithms; otherwise a slip angle can become negative and stay so."""
     known = parameter(calibration, key)
     return Free(known.value, 5e-5, max(known.low, _LEAST), known.high, logarithmic=True)
 
@@ -346,7 +350,7 @@ class _Model:
         for g, pads in enumerate(self.groups):
             span = max(_span(log, self.start) for log in pads.logs)
             for number, log in enumerate(pads.logs):
-                # The force is clear of its noise only somewhat past contact; what begins without a force has it still to come.
+                # The force exceeds its noise only somewhat past contact; a log that begins without one begins before contact.
                 guess = clearance_guess(log, _travel(log, self.start)) - 0.02 * span
                 free[g, number] = Free(guess, 5e-6 * span, 0.0 if _begins_free(log) else -np.inf)
         return free
@@ -355,8 +359,8 @@ class _Model:
         return [self._block(g, number, log) for g, pads in enumerate(self.groups) for number, log in enumerate(pads.logs)]
 
     def rising(self) -> list[Block]:
-        """What a curve that falls within its travel costs: where its slope, over all the travel, is less than a share of the
-        largest force, what it lacks of that in N."""
+        """Residuals that keep each curve rising over its travel: what its slope lacks of the least one, as force over all the
+        travel, N."""
         blocks = []
         for pads, own in zip(self.groups, self.curves, strict=True):
             span = max(float(_travel(log, self.start).max()) for log in pads.logs)
@@ -392,7 +396,7 @@ class _Model:
             clearances = np.array([found.values[key] for key in contacts])
             covariance = found.block([*own, *contacts])
             if found.values[own[0]] < 1.01 * self.free[own[0]].low and 0.0 < covariance[0, 0] < np.inf:
-                # Where a force rises is as sure as the bound that holds its first slope: the two would make up for each other.
+                # The bound holds the first slope, so that an error of the contact no longer makes up for one of the slope.
                 covariance -= np.outer(covariance[0], covariance[0]) / covariance[0, 0]
             curves.append(
                 CurveFit(

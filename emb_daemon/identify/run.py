@@ -12,14 +12,14 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.calibration import nominal, provenance, tidy
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import DELAY
+from emb_daemon.identify.dynamics import DELAY, Pads
 from emb_daemon.identify.steps import Step, attribution, contact, held_out, noise, stiffness, thermal, thickness, torque
 from emb_daemon.identify.steps.held_out import Fold
-from emb_daemon.identify.validation import Validation, at_thickness, validate, validate_others, why_worse
+from emb_daemon.identify.validation import Validation, validate, validate_fitted, validate_others, why_worse
 
 Progress = Callable[[float, str], None]
-#: Time from which the reference force is not the resolver's, s: half a cycle. Twelve rigs whose instruments are in time have
-#: up to 0.4 ms. Standard deviations at which that is certain.
+#: Delay from which the reference force counts as late, s: half a cycle (twelve rigs whose instruments are in time show 0.4 ms
+#: at most); and in its standard deviations.
 _LATE_S, _SURELY = 0.002, 5.0
 
 
@@ -61,24 +61,11 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     progress(0.05, "characteristic curves and dynamics")
     sheet, measured_mm = campaign.datasheet, [own.thickness_mm for own in pads]
     start = nominal(sheet, f"rig-{campaign.file.rig}", campaign.pad_thickness_mm, measured_mm)
-    stiff = stiffness.identify(pads, start)
-    # What the instrument's own stamps say is no part of it.
-    stamped_s = 1e-9 * float(np.median([log.stamped_later_ns for own in pads for log in own.logs]))
-    late_s = stiff.fit.delay_s + stamped_s
-    # Slow logs alone do not tell it from a relaxation.
-    told = any(own.random for own in pads) and stiff.fit.delay_s > _SURELY * stiff.fit.sigmas[DELAY]
-    if told and late_s > _LATE_S:
-        # Every step would put it down to the brake: to inertia, friction and the sigma of the force.
-        campaign.move_reference(late_s)
-        pads = thickness.load_pads(campaign)
-        note = (
-            f"The reference force comes {1e3 * late_s:.1f} ms after the resolver: all logs are judged with it at its own time."
-        )
-        stiff = replaced(stiffness.identify(pads, start), notes=(note,))
+    stiff = _stiffness_in_time(campaign, pads, start)
     if stiff.plainly_better:
         campaign.fault(f"curves: {stiff.plainly_better}")
     progress(0.3, "torque path")
-    motor = torque.identify(campaign, pads, start)
+    motor = torque.identify(campaign, stiff.pads, start)
     zero = contact.identify(stiff, sheet.resolver.count_rad, start.contact.clearance_rad)
     for note in zero.notes:
         campaign.fault(f"contact: {note}")
@@ -100,21 +87,34 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     heat = thermal.validate(campaign, heat, calibration)
     validations = []
     for fold in folds:
+        # Noise levels, too, come from other pads than those that judge them.
         others = [other for other in folds if other is not fold] or [fold]
         mine = noise.identify(campaign, stiff, motor, others, interpolation)
-        there = moved(found.without(fold), mine.values)
-        validations += [validate(f"random, {fold.pads.thickness_mm:g} mm", "random", log, there) for log in fold.held_out]
+        there, name = moved(found.without(fold), mine.values), f"random, {fold.pads.thickness_mm:g} mm"
+        validations += [validate(name, "random", log, there) for log in fold.held_out]
     validations += validate_others(campaign, calibration, thick, motor)
-    # Where nothing was left out, what was fitted must at least be inside its sigma.
-    judged = validations or [
-        validate(f"{log.path.name}, which was fitted", "fitted", log, at_thickness(calibration, thick, own.thickness_mm))
-        for own in pads
-        for log in own.logs
-    ]
-    for fault in why_worse(judged):
+    for fault in why_worse(validations or validate_fitted(stiff.pads, calibration, thick)):
         campaign.fault(fault)
     steps = (stiff, motor, heat, found)
     calibration = replace(calibration, provenance=provenance(campaign, steps, validations, heat))
     progress(1.0, "done")
     seconds = time.monotonic() - begin
     return Identification(campaign, stiff, motor, zero, folds, thick, levels, heat, found, validations, calibration, seconds)
+
+
+def _stiffness_in_time(campaign: Campaign, pads: list[Pads], start: Calibration) -> stiffness.StiffnessStep:
+    """The stiffness step, after the reference force of all logs has been moved to its own time if it clearly comes late.
+
+    Otherwise every other step would attribute the delay to the brake: to inertia, friction and the sigma of the force.
+    """
+    found = stiffness.identify(pads, start)
+    # The delay that the time stamps of the logs state is not a part of the fitted one.
+    stamped_s = 1e-9 * float(np.median([log.stamped_later_ns for own in pads for log in own.logs]))
+    late_s = found.fit.delay_s + stamped_s
+    # Slow logs alone do not tell a delay from a relaxation.
+    certain = any(own.random for own in pads) and found.fit.delay_s > _SURELY * found.fit.sigmas[DELAY]
+    if not (certain and late_s > _LATE_S):
+        return found
+    campaign.move_reference(late_s)
+    note = f"The reference force comes {1e3 * late_s:.1f} ms after the resolver: all logs are judged with it at its own time."
+    return replaced(stiffness.identify(thickness.load_pads(campaign), start), notes=(note,))

@@ -9,6 +9,7 @@ from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.identify.campaign import NEED_INTEGRATED, NEED_RANDOM, RANDOM, Campaign
+from emb_daemon.identify.dynamics import Pads
 from emb_daemon.identify.steps.thickness import ThicknessStep
 from emb_daemon.identify.steps.torque import TorqueStep
 from emb_daemon.identify.text import stem
@@ -25,10 +26,10 @@ _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
 
 @dataclass(frozen=True)
 class Validation:
-    """One log that was not fitted.
+    """One log, as a rule one that was not fitted.
 
     Attributes:
-        kind: random, predicted, gear, frequency or integrated: what was left out or predicted for it.
+        kind: random, predicted, gear, frequency or integrated: what was left out or predicted for it; or fitted.
         calibration: that was run.
         estimates: ESTIMATE rows.
         figures: `offline.score.force_figures`.
@@ -93,6 +94,15 @@ def validate_others(campaign: Campaign, ours: Calibration, thickness: ThicknessS
         if log is not None:
             found.append(validate(f"integrated, {stem(pair.judge)}", "integrated", log, ours))
     return found
+
+
+def validate_fitted(groups: list[Pads], calibration: Calibration, thickness: ThicknessStep) -> list[Validation]:
+    """Validations of fitted logs, where no others are left: their errors must at least be inside their sigma."""
+    return [
+        validate(f"{log.path.name}, which was fitted", "fitted", log, at_thickness(calibration, thickness, pads.thickness_mm))
+        for pads in groups
+        for log in pads.logs
+    ]
 
 
 def why_worse(validations: list[Validation]) -> list[str]:

@@ -20,7 +20,7 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.selection import Progress
 from emb_daemon.diagnose.text import verdict
 from emb_daemon.estimator.heat import TOUCHING_N
-from emb_daemon.identify.dynamics import Errors
+from emb_daemon.identify.dynamics import Errors, where_known
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.stiffness import StiffnessStep
@@ -104,7 +104,7 @@ def identify(stiffness: StiffnessStep, hot: Sequence[Log], known: Calibration, p
         sigmas=found.calibration.provenance.sigmas,
         calibration=calibration,
         diagnosis=found,
-        hot=tuple(_errors(bench, residual, index) for index in range(len(logs), len(bench.trials))),
+        hot=_hot_errors(bench, residual, len(logs)),
         hot_current=_unexplained(hot, calibration),
         fastest_rad_per_s=_fastest(hot),
         undecided=undecided(found.selection),
@@ -116,9 +116,12 @@ def _unsearched(hot: Sequence[Log], known: Calibration) -> AttributionStep:
     if not hot:
         return AttributionStep(calibration=known)
     bench = Bench(hot, known, own_data=True)
-    residual = bench.residuals({})["stiffness"]
-    left = tuple(_errors(bench, residual, index) for index in range(len(hot)))
-    return AttributionStep(calibration=known, hot=left, hot_current=_unexplained(hot, known), fastest_rad_per_s=_fastest(hot))
+    return AttributionStep(
+        calibration=known,
+        hot=_hot_errors(bench, bench.residuals({})["stiffness"], 0),
+        hot_current=_unexplained(hot, known),
+        fastest_rad_per_s=_fastest(hot),
+    )
 
 
 def _unexplained(logs: Sequence[Log], calibration: Calibration) -> tuple[Unexplained, ...]:
@@ -152,9 +155,8 @@ def section(page: Page, step: AttributionStep) -> None:
         sections(page, step.diagnosis)
 
 
-def _errors(bench: Bench, residual: np.ndarray, index: int) -> Errors:
-    """What is left of one log's stiffness path, of the ``residual`` of all logs."""
-    trials = bench.trials
-    first = sum(len(trial.log.samples) for trial in trials[:index])
-    known = np.isfinite(trials[index].force_N)
-    return residual[first : first + len(trials[index].log.samples)][known], trials[index].force_N[known]
+def _hot_errors(bench: Bench, residual: np.ndarray, first: int) -> tuple[Errors, ...]:
+    """Errors of the stiffness path on the logs from number ``first`` on, from the ``residual`` of all logs."""
+    ends = np.cumsum([len(trial.log.samples) for trial in bench.trials])[:-1]
+    left = list(zip(np.split(residual, ends), bench.trials, strict=True))[first:]
+    return tuple(where_known(error, trial.force_N) for error, trial in left)

@@ -10,8 +10,8 @@ from emb_daemon.wire.contract import CYCLE_S
 
 #: Samples over which one contact angle is estimated: ten seconds, in which it hardly moves.
 _ROWS = 2500
-#: Share of the information of a log's best ten seconds that others have at least: with less their contact angle is ten times
-#: as unsure, and of pads that have just parted there is nothing but a force that dies away.
+#: Least information on the contact angle, over that of the log's best ten seconds: with less, its standard deviation is over
+#: ten times as large, as where pads have just parted and the force only decays.
 _TELLS = 0.01
 #: Step of the derivative by the clearance, rad.
 _STEP = 1e-3

@@ -38,7 +38,7 @@ _UNCONFIRMED_K = 50.0
 
 @dataclass(frozen=True)
 class _Unknown:
-    """``spread``: prior standard deviation; relative, or where ``scale`` is given of value / scale."""
+    """Prior and bounds of a parameter; ``spread`` is a relative standard deviation, or one of value / scale."""
 
     spread: float
     scale: float | None = None
@@ -63,7 +63,7 @@ UNKNOWNS = {
     "thermal.disc.cooling_per_speed_J_per_rad_K": _Unknown(1.0),
     "thermal.disc.radiating_area_m2": _Unknown(1.0, scale=0.1),
 }
-#: Of these a disc's temperature tells without any of the pads': what it stores, and loses to air and pads.
+#: Those that the disc's temperature alone identifies: what the disc stores, and what it loses to air and pads.
 _OF_DISC = [key for key in UNKNOWNS if ".disc." in key or "contact_conductance" in key or "gap_conductance" in key]
 
 
@@ -115,8 +115,8 @@ def fit_heat(recordings: list[Recording], start: Calibration) -> Step:
     """Pads and disc from recordings that heat and cool them; notes name what the logs do not show.
 
     Residuals are strongly correlated and the equations approximate, so that a whole log counts as one episode, or, with fewer
-    than four logs, one sixth of each. Of discs alone nothing inside the pads is fitted: they would take whatever the disc's
-    law lacks, and run away with it elsewhere.
+    than four logs, one sixth of each. Logs of the disc alone fit nothing inside the pads: the pads' parameters would make up
+    for errors of the disc's model, and be wrong elsewhere.
     """
     told = [key for key in UNKNOWNS if key in _OF_DISC or any(r.has_pads for r in recordings)]
     pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES

@@ -7,7 +7,7 @@ import numpy as np
 from emb_daemon.calibration.parameters import CLEARANCE, moved, value_of
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import Errors, Pads, fit_dynamics, path_errors
+from emb_daemon.identify.dynamics import Errors, Pads, fit_dynamics, path_errors, where_known
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.stiffness import StiffnessStep
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
@@ -39,7 +39,8 @@ class Fold(Step):
         there = held(to_parameters(moved(calibration, {"pad_thickness_mm": self.pads.thickness_mm})))
         return replace(
             self,
-            errors=[_errors(log, there) for log in self.held_out],
+            # Of the whole step: effects that follow heat act on cold pads, too, and need their temperature.
+            errors=[where_known(run_step(log.samples, there)["force"] - log.force_N, log.force_N) for log in self.held_out],
             unexplained=[unexplained_current(log, found, calibration) for log in self.held_out],
         )
 
@@ -66,10 +67,3 @@ def _fold(campaign: Campaign, stiffness: StiffnessStep, index: int) -> Fold:
         errors=[path_errors(log, own.calibration, pads.thickness_mm, clearance) for log in pads.random],
         unexplained=[unexplained_current(log, torque, joint.calibration) for log in pads.random],
     )
-
-
-def _errors(log: Log, parameters: np.ndarray) -> Errors:
-    """Errors of the stiffness path in the whole step: what follows heat acts on cold pads too, and needs their temperature."""
-    error = run_step(log.samples, parameters)["force"] - log.force_N
-    known = np.isfinite(error)
-    return error[known], log.force_N[known]

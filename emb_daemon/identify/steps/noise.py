@@ -4,13 +4,16 @@ The daemon's standard deviation is judged against a reference instrument and mus
 errors on held-out data do.
 """
 
+from collections.abc import Sequence
+from functools import reduce
+
 import numpy as np
 
 from emb_daemon.calibration.curves import rising_force
 from emb_daemon.calibration.parameters import INERTIA, LOAD_FRICTION, OFFSET_FRICTION, TORQUE_CONSTANT
 from emb_daemon.calibration.types import Calibration
 from emb_daemon.identify.campaign import Campaign
-from emb_daemon.identify.dynamics import EPISODE, errors_unseen
+from emb_daemon.identify.dynamics import EPISODE, Errors, errors_unseen
 from emb_daemon.identify.steps import Step
 from emb_daemon.identify.steps.attribution import AttributionStep
 from emb_daemon.identify.steps.held_out import Fold
@@ -28,7 +31,7 @@ from emb_daemon.wire.contract import CYCLE_S
 #: One minus the squared friction state below which a gear slides.
 _SLID = 0.1
 #: Relative error of an extrapolated curve from which a note is written: the usual relative noise of the path.
-_TOLD = 0.01
+_NOTED = 0.01
 #: Length of the stretches, in samples, from which noise is identified, if there are any that long.
 _LONG = 50
 #: Resolver movement that still counts as standing, rad.
@@ -49,59 +52,71 @@ def identify(
         interpolation: relative force error that a curve between two measured pad thicknesses adds.
         found: the search, once it is done; what it leaves of hot pads is used where it is larger than that of cold pads.
     """
-    found = found or AttributionStep(calibration=stiffness.fit.calibration)
-    logs = [log for pads in stiffness.pads for log in pads.logs]
-    known, notes = stiffness.fit.calibration, []
-    speed = speed_noise(logs)
+    known = stiffness.fit.calibration
+    found = found or AttributionStep(calibration=known)
+    gear_gain, rated_N = known.motor.gear_gain_m_per_rad, campaign.datasheet.actuator.rated_clamp_force_N
+    notes = []
+    speed = speed_noise([log for pads in stiffness.pads for log in pads.logs])
     if speed is None:
         speed = campaign.datasheet.resolver.count_rad / CYCLE_S
         notes.append("The motor never stands for 0.2 s: speed noise is one resolver count per sample, not measured.")
-    if folds:
-        errors = [pair for fold in folds for pair in fold.errors]
-        held_out = [left for fold in folds for left in fold.unexplained]
-    else:
-        chosen, random = stiffness.chosen, any(pads.random for pads in stiffness.pads)
-        errors = errors_unseen(stiffness.pads, chosen.fit) if random else chosen.held_out
-        held_out = [unexplained_current(log, torque.fit, known) for log in torque.logs]
+    if not folds:
         notes.append(
             "Fewer than two pad thicknesses with a slow and a random log: nothing could be held out by thickness, and noise "
             "levels come from the second halves of the random logs; without these from slow logs, each predicted from the "
             "others of its pads, a single one as it was fitted."
         )
-    gear_gain = known.motor.gear_gain_m_per_rad
-    error, force = map(np.concatenate, zip(*errors, strict=True))
-    floor, relative = force_error_levels(error, force)
-    # What a relative error explains by the reference's force the daemon does not know where the path tells of none.
-    none = np.abs(force + error) < floor
-    floor = max(floor, rmse(error[none])) if none.any() else floor
-    more = [(error, force) for error, force in found.hot if rmse(error) > rmse(np.hypot(floor, relative * force))]
-    if more:
-        errors = [*errors, *more]
-        floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))
-    levels = {
-        "stiffness_N": floor,
-        "stiffness_relative": float(np.hypot(relative, interpolation)),
-        "stiffness_correlation_s": integral_time([error for error, _ in errors]),
-        **torque_levels(held_out + _more_current(held_out, found.hot_current), gear_gain, speed),
-        "torque_lasting": _lasting([*held_out, *found.hot_current], gear_gain, known.stiffness.maximum_force_N),
-    }
+    errors, unexplained = _on_others(stiffness, torque, folds)
+    floor, relative, correlation_s = _stiffness_levels(errors, found.hot)
+    unknown_lag = 0.0
     if not any(pads.random for pads in stiffness.pads):
-        levels["stiffness_relative"] = float(
-            np.hypot(levels["stiffness_relative"], _unknown_lag(stiffness, campaign, found.fastest_rad_per_s))
-        )
+        unknown_lag = _unknown_lag(stiffness, campaign, found.fastest_rad_per_s)
         notes.append(
             "No random log: the stiffness path's relative noise holds what an unknown relaxation does in a hard clamp."
         )
-    rated = campaign.datasheet.actuator.rated_clamp_force_N
-    beyond = _extrapolation(stiffness, rated)
-    if beyond > _TOLD:
-        campaign.fault(_unsure_at_the_end(stiffness.reached_N, rated, beyond))
-    levels["stiffness_relative"] = float(np.hypot(levels["stiffness_relative"], beyond))
+    beyond = _extrapolation(stiffness, rated_N)
+    if beyond > _NOTED:
+        campaign.fault(_unsure_at_the_end(stiffness.reached_N, rated_N, beyond))
+    levels = {
+        "stiffness_N": floor,
+        "stiffness_relative": _together(relative, interpolation, unknown_lag, beyond),
+        "stiffness_correlation_s": correlation_s,
+        **torque_levels(unexplained + _more_current(unexplained, found.hot_current), gear_gain, speed),
+        "torque_lasting": _lasting([*unexplained, *found.hot_current], gear_gain, known.stiffness.maximum_force_N),
+    }
     # The daemon does not know how worn its gear is.
-    levels["torque_relative"] = float(np.hypot(levels["torque_relative"], torque.gear_wear() / gear_gain))
+    levels["torque_relative"] = _together(levels["torque_relative"], torque.gear_wear() / gear_gain)
     values = {f"noise.{name}": value for name, value in levels.items()}
-    values |= {key: float(np.hypot(values[key], share)) for key, share in found.undecided.items()}
+    values |= {key: _together(values[key], share) for key, share in found.undecided.items()}
     return Step(values=values, notes=tuple(notes))
+
+
+def _together(*sigmas: float) -> float:
+    """Standard deviation of the sum of independent errors."""
+    return float(reduce(np.hypot, sigmas))
+
+
+def _on_others(stiffness: StiffnessStep, torque: TorqueStep, folds: list[Fold]) -> tuple[list[Errors], list[Unexplained]]:
+    """Errors of the stiffness path and unexplained currents on logs that were not fitted, as far as there are any."""
+    if folds:
+        return [pair for fold in folds for pair in fold.errors], [left for fold in folds for left in fold.unexplained]
+    chosen, random = stiffness.chosen, any(pads.random for pads in stiffness.pads)
+    errors = errors_unseen(stiffness.pads, chosen.fit) if random else chosen.held_out
+    return errors, [unexplained_current(log, torque.fit, stiffness.fit.calibration) for log in torque.logs]
+
+
+def _stiffness_levels(errors: list[Errors], hot: Sequence[Errors]) -> tuple[float, float, float]:
+    """Floor (N), relative part and correlation time (s) of the stiffness path's ``errors``, and of those on ``hot`` logs that
+    are larger than they."""
+    error, force = map(np.concatenate, zip(*errors, strict=True))
+    floor, relative = force_error_levels(error, force)
+    # Where the path shows no force a relative part covers nothing, whatever the reference shows: the floor alone has to.
+    none = np.abs(force + error) < floor
+    floor = max(floor, rmse(error[none])) if none.any() else floor
+    if more := [(error, force) for error, force in hot if rmse(error) > rmse(np.hypot(floor, relative * force))]:
+        errors = [*errors, *more]
+        floor, relative = force_error_levels(*map(np.concatenate, zip(*errors, strict=True)))
+    return floor, relative, integral_time([error for error, _ in errors])
 
 
 def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign, fastest_rad_per_s: float) -> float:
@@ -215,8 +230,13 @@ def _with_what_lasts(residuals: list[np.ndarray], sigma_A: float, time_s: float)
 
 def _more_current(held_out: list[Unexplained], hot: tuple[Unexplained, ...]) -> list[Unexplained]:
     """The ``hot`` logs with more unexplained current over a manoeuvre and longer than any of ``held_out``."""
-    most = max((rmse(means) for left in held_out if len(means := _means(_without_gaps(left, left.current_A)))), default=np.inf)
-    return [left for left in hot if len(means := _means(_without_gaps(left, left.current_A))) and rmse(means) > most]
+    most = max(filter(np.isfinite, map(_lasting_A, held_out)), default=np.inf)
+    return [left for left in hot if _lasting_A(left) > most]
+
+
+def _lasting_A(left: Unexplained) -> float:
+    """RMS of the means of an unexplained current over manoeuvres, A; NaN without one that long."""
+    return rmse(_means(_without_gaps(left, left.current_A)))
 
 
 def _lasting(held_out: list[Unexplained], gear_gain: float, maximum_force_N: float) -> float:
@@ -270,7 +290,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         gains.append(float(load @ torque / (load @ load)))
     turning, excess = np.concatenate(turning), np.concatenate(excess)
     share = float(turning @ excess / (turning @ turning)) if np.any(turning > 0.0) else 0.0
-    # Short stretches show little, but a friction that takes most of a log to turn over leaves no longer ones.
+    # Short stretches show little, but where friction turns over for most of a log there are no longer ones.
     series = [s for s in series if len(s) > _LONG] or series
     sigma, time = _with_what_lasts(series, *current_noise(series, difference))
     return {

@@ -38,14 +38,14 @@ USUAL_RELAXATION_S = 0.03
 _RISING = 0.999
 #: Factor on the least held-out error of all combinations up to which a combination with fewer effects is preferred.
 _WORTH = 1.02
-#: The same where a slow log was fitted that nothing was left out of: slow clamps of two independent rigs fall to a third and
-#: an eighth by their loop and slow relaxation together. What lags by 0.015 to 0.08 s instead of the usual 0.03 s passes for
-#: an effect beyond it, too, and fast motion is told no worse by it (studied on the thesis's brake).
+#: The same where pads have a single slow log, which is judged as it was fitted. Real effects are far beyond it: loop and slow
+#: relaxation together lower the error of slow clamps of two independent rigs to a third and an eighth. A lag of 0.015 to
+#: 0.08 s instead of the usual 0.03 s also passes for an effect, without a loss in fast motion (studied on the thesis's brake).
 _WORTH_SEEN = 1.25
 #: Least amplitude of an effect, in its standard deviations.
 _CLEAR = 3.0
 _DELAY_TITLE = "reference later than resolver (not in the calibration)"
-#: Factor by which a plain fit must leave less on left-out logs to be said: what noise alone makes.
+#: Ratio of errors on left-out logs from which a plain fit is reported as better: noise alone makes five per cent.
 _PLAINLY = 1.05
 #: Style of many measured points behind a line.
 _CLOUD = Style("#aab4c0", mode="markers", size=3.0)
@@ -153,7 +153,7 @@ def _plain(groups: list[Pads]) -> float:
     for pads in groups:
         x = np.concatenate([log.samples["angle"] for log in pads.logs])
         middle, half = 0.5 * (np.min(x) + np.max(x)), max(0.5 * np.ptp(x), 1e-9)
-        tables = [_cubic_of_each_way((log.samples["angle"] - middle) / half) for log in pads.logs]
+        tables = [cubic_of_each_way((log.samples["angle"] - middle) / half) for log in pads.logs]
         known = [np.isfinite(log.force_N) for log in pads.logs]
         parts = [(table[told], log.force_N[told]) for table, told, log in zip(tables, known, pads.logs, strict=True)]
         for number, (table, force) in enumerate(parts):
@@ -163,8 +163,8 @@ def _plain(groups: list[Pads]) -> float:
     return rmse(np.concatenate(errors))
 
 
-def _cubic_of_each_way(x: np.ndarray) -> np.ndarray:
-    """Regressors, shape (n, 8)."""
+def cubic_of_each_way(x: np.ndarray) -> np.ndarray:
+    """Regressors of a force over an angle ``x``: a cubic, and what is added while closing; shape (n, 8)."""
     cubic = np.vander(x, 4)
     return np.column_stack([cubic, np.sign(np.gradient(x))[:, None] * cubic])
 
