@@ -23,7 +23,7 @@ from emb_daemon.ahead.signature import Array, Entry, Function, Kind, name_in_c
 
 __all__ = [
     "ENTRIES", "Array", "Booleans", "Bytes", "Floats", "Integer", "Record", "Records", "compile_beside",
-    "compiled_for_the_next_start", "depend_on", "entry", "fields", "hypot", "njit", "sq",
+    "compile_within", "compiled_for_the_next_start", "depend_on", "entry", "fields", "hypot", "njit", "sq",
 ]  # fmt: skip
 
 # What annotations of kernels name. The fields of a `Record` are those of the numpy dtype that the argument's name or the
@@ -74,15 +74,20 @@ if library.in_use() or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" or import
     def compiled_for_the_next_start() -> bool:
         return False
 
-    def compile_beside(function: Callable[..., object], work: Callable[[], object]) -> Callable[[], object]:
+    def compile_beside(
+        function: Callable[..., object], work: Callable[[], object], parts: Callable[[], object]
+    ) -> Callable[[], object]:
         return lambda: None
+
+    def compile_within(function: Callable[..., object], *arguments: object) -> None:
+        pass
 
     def depend_on(source: Path) -> None:
         if library.in_use():
             raise RuntimeError(f"{source}: is not in the kernels compiled ahead; set {library.VARIABLE}= (empty) to use numba")
 
 else:
-    from emb_daemon.numba_cache import compile_beside, compiled_for_the_next_start, depend_on, njit
+    from emb_daemon.numba_cache import compile_beside, compile_within, compiled_for_the_next_start, depend_on, njit
 
 
 def entry(*takes: Kind, returns: int = 0) -> Callable[[Function], Function]:

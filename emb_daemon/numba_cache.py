@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from numba import typeof
 from numba.core import config, event, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.core.compiler import compile_result
@@ -70,11 +71,14 @@ def compiled_for_the_next_start() -> bool:
     return _compilations.count > 0 and _private is None
 
 
-def compile_beside(function: Callable[..., object], work: Callable[[], object]) -> Callable[[], object]:
+def compile_beside(
+    function: Callable[..., object], work: Callable[[], object], parts: Callable[[], object]
+) -> Callable[[], object]:
     """Let another process do ``work``, which compiles ``function`` and more, while this one compiles something else.
 
-    Only if ``function`` is not in the cache, there is a second CPU, and no other thread that may hold a lock. Returns a
-    function that waits for the end of the work.
+    Only if ``function`` is not in the cache, there is a second CPU, and no other thread that may hold a lock. Then this
+    process does ``parts`` at once, with `compile_within`: kernels that the work calls late, and then finds in the cache.
+    Returns a function that waits for the end of the work.
     """
     possible = threading.active_count() == 1 and len(os.sched_getaffinity(0)) > 1
     if _private is not None or not possible:
@@ -87,7 +91,13 @@ def compile_beside(function: Callable[..., object], work: Callable[[], object]) 
             work()
         finally:
             os._exit(0)
+    parts()
     return lambda: os.waitpid(child, 0)
+
+
+def compile_within(function: Callable[..., object], *arguments: object) -> None:
+    """Compile a function as kernels call it with ``arguments`` of these types, of which the values do not count."""
+    function._within.compile(tuple(map(typeof, arguments)))
 
 
 _compilations = _Compilations()

@@ -9,7 +9,11 @@ from numba import types
 
 import emb_daemon
 from emb_daemon.ahead.library import installed_digest, source_digest
+from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.jit import njit
+from emb_daemon.pipeline import Pipeline
+from emb_daemon.runtime.daemon import _compile_fusion
+from emb_daemon.wire.layout import CORNERS
 
 _PACKAGE = Path(emb_daemon.__file__).parent
 _CALL = """
@@ -81,6 +85,15 @@ def test_functions_that_only_kernels_call_are_translated_with_them():
     is_translated = kernel.codegen._engine.is_symbol_defined
     assert is_translated(kernel.fndesc.llvm_func_name)
     assert not any(is_translated(part.fndesc.llvm_func_name) for part in parts)
+
+
+def test_what_the_daemon_compiles_beside_the_estimator_is_what_the_estimator_calls(shipped_setup):
+    """With other types it would be compiled for nothing, and the estimator's own version after it."""
+    scratch = Pipeline(shipped_setup.parameters.copy(), CORNERS)
+    scratch.answer(0)
+    _compile_fusion(scratch)
+    for function in (fuse, take_sides):
+        assert len(function._numba_type_.dispatcher._cache._cache_file._load_index()) == 1
 
 
 _FAR = """
