@@ -216,8 +216,8 @@ def test_files_that_are_not_calibrations_are_refused_with_the_fault(tmp_path, co
     assert any(expected in fault for fault in caught.value.faults)
 
 
-def test_what_is_no_file_holds_nobody_up(tmp_path):
-    """A pipe, to which nobody writes; a device that never ends."""
+def test_what_is_no_file_is_refused_at_once(tmp_path):
+    """A pipe without a writer; a device that never ends."""
     os.mkfifo(tmp_path / "calibration.yaml")
     for path in (tmp_path / "calibration.yaml", Path("/dev/zero")):
         with pytest.raises(InputErrors, match="not a regular file"):

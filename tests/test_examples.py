@@ -93,7 +93,7 @@ def test_a_time_step_must_be_above_zero(dt_s):
     [("current_A", "current lost"), ("wheel_speed_rad_per_s", "wheel speed lost"), ("wheel_pulse", "wheel pulse lost")],
 )
 def test_an_optional_input_that_is_not_finite_counts_as_missing(name, reason, value):
-    """And is forgotten: what comes after is as good as ever."""
+    """It has no influence on later estimates."""
     estimator = emb_daemon.Estimator()
     estimator.step(0.0, 0.0, 0.0, **_REST)
     arguments = {"angle_rad": 0.0, "speed_rad_per_s": 0.0, "current_A": 0.0, **_REST}
@@ -166,6 +166,6 @@ def test_example_own_effect(tmp_path):
 
 
 def test_an_effect_registered_too_late_is_refused():
-    """Once the estimator is compiled without it, it would be believed and do nothing."""
+    """The estimator is compiled without it by then, and it would have no effect."""
     with pytest.raises(RuntimeError, match="already"):
         extend(REGISTRY[0])

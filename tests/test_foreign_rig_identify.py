@@ -1,4 +1,4 @@
-"""`identify` on what another rig has: a calibration as good as it says, and a word on what is missing."""
+"""`identify` on logs of other rigs: sigma covers the error, and what is missing or wrong is named."""
 
 import re
 import shlex
@@ -101,9 +101,9 @@ def _overconfident(monkeypatch):
     monkeypatch.setattr(validation, "estimate", overconfident)
 
 
-def test_a_force_that_gives_way_is_no_curve_and_has_a_sigma_for_that(tmp_path, capsys, monkeypatch):
-    """A dome that collapses and is then pressed flat: the contact is found where it rises for good, and the force before it
-    is in sigma, though a force of nothing has no relative error."""
+def test_sigma_covers_a_force_that_collapses_and_rises_again(tmp_path, capsys, monkeypatch):
+    """A rubber dome that collapses and is then pressed flat: the contact is where the force rises for good. Sigma covers the
+    force before it, although a relative error of no force is nothing."""
     campaign = foreignkit.write_campaign(tmp_path, curve=_low())
     _dome(tmp_path, "curve.parquet")
     mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
@@ -139,8 +139,8 @@ def _dome(tmp_path, *names: str) -> None:
     mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
 
 
-def test_a_curve_that_predicts_less_than_a_plain_cubic_is_said(tmp_path, capsys):
-    """Of two logs each is predicted from the other: of a dome much worse than a cubic does."""
+def test_a_curve_that_predicts_worse_than_a_plain_cubic_is_reported(tmp_path, capsys):
+    """Each of two logs is predicted from the other; the force of a dome is predicted much worse than by a cubic."""
     campaign = foreignkit.write_campaign(tmp_path, curve_1=_low(), curve_2=_low())
     _dome(tmp_path, "curve_1.parquet", "curve_2.parquet")
     mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
@@ -152,7 +152,7 @@ def test_a_curve_that_predicts_less_than_a_plain_cubic_is_said(tmp_path, capsys)
 
 
 @pytest.mark.parametrize(("plain_N", "said"), [(None, False), (80.0, True), (97.0, False), (200.0, False)])
-def test_a_cubic_that_predicts_as_well_says_nothing(plain_N, said):
+def test_a_cubic_that_predicts_as_well_is_not_reported(plain_N, said):
     step = SimpleNamespace(chosen=SimpleNamespace(held_out_rmse=100.0), plain_N=plain_N)
     assert bool(stiffness.StiffnessStep.plainly_better.fget(step)) == said
 
@@ -172,7 +172,7 @@ def test_a_plain_cubic_is_fitted_to_the_logs_that_it_is_not_judged_on():
     assert left[1] == pytest.approx(np.sqrt((300.0**2 + 2.0 * 150.0**2) / 3.0), rel=0.05)
 
 
-def test_an_angle_the_wrong_way_round_is_told(tmp_path, capsys):
+def test_an_angle_of_the_wrong_sign_is_named(tmp_path, capsys):
     campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow(seconds=8.0))
     columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=8.0)), 500.0)
     turned = {"angle_rad": -columns["angle_rad"], "speed_rad_per_s": -columns["speed_rad_per_s"]}
@@ -182,8 +182,8 @@ def test_an_angle_the_wrong_way_round_is_told(tmp_path, capsys):
     assert "turn the angle round (`scale: -1`" in capsys.readouterr().err
 
 
-def test_an_angle_behind_a_gear_is_told_with_its_ratio(tmp_path, capsys):
-    """Its log does not seem to begin released, since its clearance is small; why is what the user has to know."""
+def test_an_angle_behind_a_gear_is_named_with_its_ratio(tmp_path, capsys):
+    """Its clearance is so small that the log seems not to begin released; the message states the ratio as the cause."""
     motion = foreignkit.random(seconds=4.0)
     campaign = foreignkit.write_campaign(tmp_path, random=motion)
     columns = foreignkit.sampled(foreignkit.truth(motion), 500.0)
@@ -203,7 +203,7 @@ def test_a_misspelt_log_is_an_error(tmp_path, capsys):
 
 @pytest.mark.trial
 def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
-    """The commands of the page, on the example that the first of them writes."""
+    """The commands of docs/own_actuator.md, on the example that the first of them writes."""
     hour = _PAGE.read_text(encoding="utf-8").partition("## A first hour")[2].partition("\n1. ")[0]
     commands = [shlex.split(line) for line in re.findall(r"^    (emb-daemon .+)$", hour, re.MULTILINE)]
     assert [command[1] for command in commands] == ["identify", "identify", "replay"]
@@ -220,8 +220,8 @@ def test_the_first_hour_runs_as_printed(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.trial
-def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeypatch):
-    """In slow clamps alone, a gear with play passes for friction that turns over within a radian: 1.7 kN in a stop."""
+def test_a_drive_shows_friction_that_slow_motion_hides(tmp_path, capsys, monkeypatch):
+    """From slow clamps alone, a gear with play looks like friction that turns over within a radian: 1.7 kN error in a stop."""
     effects = {"stribeck_friction": {"rise": 0.25, "speed_rad_per_s": 14.0}, "backlash": {"play_rad": 0.12}}
     shipped = shipped_calibration()
     plant = plant_from_calibration(shipped, effects=effects)
@@ -249,7 +249,7 @@ def test_a_drive_tells_friction_that_slow_motion_hides(tmp_path, capsys, monkeyp
 
 @pytest.mark.parametrize("rate_Hz", [50.0, 20.0])
 def test_a_slow_clamp_may_be_sampled_slowly(tmp_path, capsys, rate_Hz):
-    """Of a slow motion the way between two samples is known at 50 Hz and less; of a fast one it is said that it is not."""
+    """The motion between two samples is known at 50 Hz and less if it is slow; a fast one is refused with that reason."""
     campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow(), random=foreignkit.random())
     for name, angle in (("curve", foreignkit.slow()), ("random", foreignkit.random())):
         foreignkit.write_table(tmp_path / f"{name}.parquet", foreignkit.sampled(foreignkit.truth(angle), rate_Hz))

@@ -168,7 +168,7 @@ def test_a_disc_that_turns_otherwise_than_the_campaign_says_is_left_out(rig, tmp
 
 
 def test_a_log_that_is_too_short_says_how_long_one_must_be(rig, tmp_path, monkeypatch):
-    """A screw is driven home in a second and a half: that its samples are 4 ms apart is no fault of it."""
+    """A screw that is driven in within 1.5 s: the message does not blame the sampling of 4 ms."""
     campaign = load_campaign(_campaign(tmp_path, rig, ""))
     log = campaign.load(f"{rig}/static/random_6p5mm.log.gz", "random", "motion")
     short = SimpleNamespace(samples=log.samples[:400], force_N=log.force_N[:400], time_s=log.time_s[:400])
@@ -179,7 +179,7 @@ def test_a_log_that_is_too_short_says_how_long_one_must_be(rig, tmp_path, monkey
 
 
 def test_a_force_that_no_such_brake_reaches_is_left_out(rig, tmp_path):
-    """Of a brake that jammed, or in another unit; not that of a sensor with outliers."""
+    """Jammed, or in another unit; single outliers of a sensor are accepted."""
     sheet = (rig / "datasheet.yaml").read_text()
     (tmp_path / "datasheet.yaml").write_text(sheet)
     (tmp_path / "campaign.yaml").write_text("rig: A\ndatasheet: datasheet.yaml\n")
@@ -246,7 +246,7 @@ def test_the_report_opens_in_a_browser(identified, tmp_path):
 
 @pytest.mark.trial
 def test_a_late_reference_is_no_property_of_the_brake(rig, tmp_path):
-    """A sample late, it made the force uncertain by 3.7 % of it instead of 0.33, and inertia another."""
+    """A reference that is a sample late raised the relative sigma of the force from 0.33 to 3.7 %, and changed the inertia."""
 
     def late(path):
         frames, digest = read.read_with_digest(path)

@@ -175,8 +175,9 @@ def test_current_noise_tells_what_is_coloured_from_a_difference_of_noisy_speeds(
     assert (sigma, time) == pytest.approx((0.3, 0.02), rel=0.1)
 
 
-def test_what_stays_for_a_manoeuvre_is_in_the_noise_of_the_current():
-    """The density at the slow end, 2 sigma^2 time: what lasts adds its own to it, and nothing is added where nothing does."""
+def test_an_error_that_lasts_for_a_manoeuvre_is_in_the_noise_of_the_current():
+    """The spectral density at low frequency, 2 sigma^2 time, rises by that of the lasting part; without one nothing is
+    added."""
     plain = _coloured(np.random.default_rng(3), 60_000, 0.3, 0.02)
     stays = np.repeat(np.random.default_rng(4).normal(0.0, 0.2, 240), 250)
     sigma, time = noise._with_what_lasts([plain], 0.3, 0.02)
@@ -187,7 +188,7 @@ def test_what_stays_for_a_manoeuvre_is_in_the_noise_of_the_current():
     assert noise._with_what_lasts([plain[:100]], 0.3, 0.02) == (0.3, 0.02)
 
 
-def test_a_current_that_is_explained_in_short_stretches_alone_has_a_noise():
+def test_current_noise_is_found_from_short_stretches_where_there_are_no_others():
     """Friction that turns over for most of a slow clamp leaves tens of samples at a time in which it is known."""
     found = TorqueFit(dict.fromkeys(KEYS, 1.0), np.eye(len(KEYS)), {})
     rows = np.concatenate([np.arange(20) + 100 * piece for piece in range(100)])
@@ -196,8 +197,8 @@ def test_a_current_that_is_explained_in_short_stretches_alone_has_a_noise():
     assert noise.torque_levels([left], 1e-5, 0.0)["current_A"] == pytest.approx(0.2, rel=0.15)
 
 
-def test_errors_of_a_fit_are_of_what_it_has_not_seen():
-    """Of random logs the second halves, of slow ones all; with the delay of the reference instrument, here two samples."""
+def test_errors_of_a_fit_are_on_samples_that_were_not_fitted():
+    """On the second halves of random logs and on whole slow logs; the reference is two samples late here."""
     known = foreignkit.calibration()
     clearance, logs = known.contact.clearance_rad, []
     for angle in (foreignkit.slow(), foreignkit.random(seconds=8.0)):
@@ -235,9 +236,9 @@ def _slow_log(known, *, stiffer=1.0, seed=0):
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_a_slow_clamp_alone_shows_what_is_slower_than_it(there):
-    """A loop and a slow relaxation, which a curve alone would have to lie in the middle of; and none that are not there,
-    where a first relaxation of another time than the usual one looks a little like a loop."""
+def test_a_slow_clamp_alone_shows_hysteresis_and_slow_relaxation(there):
+    """A loop and a slow relaxation are found where they are. Where neither is, a first relaxation of another time than the
+    usual one looks a little like a loop, and none is found."""
     own = {
         "effects.stiffness_hysteresis.share": 0.02,
         "effects.stiffness_hysteresis.slip_angle_rad": 1.0,
@@ -257,8 +258,9 @@ def test_a_slow_clamp_alone_shows_what_is_slower_than_it(there):
 
 
 @pytest.mark.parametrize("preload_N", [0.0, 2000.0])
-def test_a_log_that_begins_without_a_force_has_its_contact_still_to_come(preload_N):
-    """A force that rises at once and then flattens is no cubic: a contact far before the log fits it, and no other log."""
+def test_a_log_that_begins_without_a_force_begins_before_contact(preload_N):
+    """A force that rises at once and then flattens is no cubic from contact on: a contact far before the log would fit it, but
+    no other log."""
     known = _one_curve()
     log = _slow_log(known)
     travel = log.samples["angle"] - log.samples["angle"][0]
@@ -268,9 +270,9 @@ def test_a_log_that_begins_without_a_force_has_its_contact_still_to_come(preload
 
 
 @pytest.mark.parametrize(("zero_N", "drag_N", "apart"), [(0.0, 13.0, 0.5), (30.0, 30.0, 6.0)])
-def test_what_a_jaw_drags_on_its_way_is_no_contact(zero_N, drag_N, apart):
-    """From there a curve that rises, falls and rises again fits best, and the calibration ended at a fortieth of the force. A
-    sensor's zero and a drag that are a tenth of it may place the contact too early, but the curve rises."""
+def test_a_constant_drag_before_contact_is_no_contact(zero_N, drag_N, apart):
+    """The best cubic from the start of the drag on rises, falls and rises again, so that the calibration ended at a fortieth
+    of the force. A zero or drag of a tenth of the force may still put the contact too early, but the curve rises."""
     known = _one_curve()
     time_s = 0.015 * np.arange(500)
     angle = np.clip(6.0 * (time_s - 0.5), 0.0, 34.5)
@@ -299,24 +301,25 @@ def pressed():
     return stiffness.identify([Pads(known.pad_thickness_mm, (_press_log(20.0),))], replace(known, effects={}))
 
 
-def test_contact_is_as_sure_as_a_bound_that_holds_the_first_slope(pressed):
-    """Slope at contact and contact make up for each other: with the slope free it was 30 rad and 400 of standard deviation."""
+def test_a_bound_on_the_first_slope_bounds_the_sigma_of_the_contact(pressed):
+    """With a free slope at contact, slope and contact angle compensate each other: the fit ended 30 rad off with a standard
+    deviation of 400 rad."""
     curve = pressed.fit.curves[0]
     assert curve.clearances_rad == pytest.approx(30.0, abs=0.3) and curve.clearance_sigmas_rad < 0.3
     assert pressed.fit.rms < 4.0
 
 
-def test_a_slow_log_is_searched_from_a_curve_that_fits_it():
-    """What a load cell's error over a screw's turn is from sample to sample, a regression over the last sample takes for a lag
-    of seconds, and the search began at a third of the force and ended at another contact."""
+def test_the_search_on_a_slow_log_starts_from_a_curve_that_fits_it():
+    """The regression over the last sample takes a load cell's periodic error over the screw's turn for a lag of seconds: the
+    search began at a third of the force and ended at another contact."""
     log, known = _press_log(200.0, ripple_N=60.0), _one_curve()
     start = starting_point([Pads(known.pad_thickness_mm, (log,))], known, ()).stiffness.curves[0].coefficients
     past = 50.0 - clearance_guess(log, log.samples["angle"] - log.samples["angle"][0])
     assert powers(np.array([past])) @ start == pytest.approx(log.force_N.max(), rel=0.1)
 
 
-def test_what_dies_away_after_a_release_is_no_walk_of_the_contact(pressed):
-    """Of half a minute with the pads apart the force says nothing of their contact."""
+def test_a_force_that_decays_after_a_release_is_no_walk_of_the_contact(pressed):
+    """Half a minute with the pads apart says nothing of their contact."""
     assert contact.identify(pressed, 1e-4, 30.0).values["contact.walk_rad_per_sqrt_s"] < 0.05
 
 
@@ -331,7 +334,7 @@ def test_a_loop_of_a_rubber_is_found():
 
 @pytest.mark.trial
 def test_a_slow_log_is_predicted_from_the_others_of_its_pads():
-    """As fitted, half of what tells two clamps apart would be in the error, and in sigma."""
+    """Judged on logs that were fitted, error and sigma would hold only half of the difference between two clamps."""
     known = _one_curve()
     logs = _slow_log(known), _slow_log(known, stiffer=1.2, seed=1)
     found = stiffness.identify([Pads(known.pad_thickness_mm, logs)], known)
@@ -339,8 +342,8 @@ def test_a_slow_log_is_predicted_from_the_others_of_its_pads():
     assert all(rmse(error) > 1.8 * fitted > 200.0 for error, _ in found.chosen.held_out)
 
 
-def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_leave_less():
-    """A gear whose gain follows what the brake has done shows it on no cold log: the filter would trust the torque."""
+def test_the_current_unexplained_on_hot_logs_is_in_its_noise_where_cold_ones_leave_less():
+    """A gear gain that follows heat shows on no cold log: without the hot ones the filter would trust the torque too much."""
     found = TorqueFit(dict.fromkeys(KEYS, 1.0), np.eye(len(KEYS)), {})
     rng, rows = np.random.default_rng(9), np.arange(20_000)
 
@@ -362,8 +365,8 @@ def test_what_a_hot_brake_leaves_of_the_current_is_in_its_noise_where_cold_ones_
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.0, 0.0), (0.008, 0.0), (0.05, 0.05), (0.2, 0.2)])
-def test_torque_that_is_off_by_another_share_in_each_manoeuvre_lasts(share, found):
-    """Noise of 0.3 N m on 1 N m says nothing of it, nor does an open brake; a hot log's counts where cold ones show none."""
+def test_a_torque_error_that_is_constant_within_each_manoeuvre_is_lasting(share, found):
+    """Neither noise of 0.3 N m on 1 N m nor an open brake counts as lasting. A hot log counts where cold ones show nothing."""
     fit = TorqueFit(dict.fromkeys(KEYS, 1.0) | {LOAD_FRICTION: 0.0}, np.eye(len(KEYS)), {})
     rng, rows = np.random.default_rng(11), np.delete(np.arange(20_000), slice(9_000, 9_250))
     force = np.where(rows % 2000 < 250, 10.0, 1e4 * rng.uniform(0.7, 1.3, len(rows)))
@@ -377,8 +380,8 @@ def test_torque_that_is_off_by_another_share_in_each_manoeuvre_lasts(share, foun
     assert noise._lasting([left(0.0), silent, left(share)], 1e-4, 2e4) == pytest.approx(found, rel=0.25)
 
 
-def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current(monkeypatch):
-    """Its signal is there in the whole step alone: by the force paths of cold pads the term would do nothing."""
+def test_current_explained_by_a_term_over_brake_torque_is_no_noise(monkeypatch):
+    """The whole step has to be run: the force paths of cold pads have no brake torque, so that the term would do nothing."""
     calibration = shipped_calibration()
     hidden = {"size": 0.2, "signal": PLANT_SIGNALS.index("brake_torque"), "exponent": 1.0, "other": -1.0}
 
@@ -407,9 +410,9 @@ def test_what_a_term_over_brake_torque_explains_is_no_noise_of_the_current(monke
     assert np.isfinite(unexplained_current(log, found, known, hot=True).current_A).all()
 
 
-def test_what_a_term_over_temperature_does_to_cold_pads_is_no_error_of_a_fold():
-    """Of 27 % it was, where the term and the curve beside it were found together: a brake that knew its force to 30 N stated
-    a tenth of it."""
+def test_the_effect_of_a_term_over_temperature_on_cold_pads_is_no_error_of_a_fold():
+    """Without the temperature, the error was 27 % where term and curve had been fitted together, and a brake known to 30 N had
+    a sigma of a tenth of its force."""
     term = Term(
         name="term:stiffness:surface_temperature", port="stiffness", signal="surface_temperature", shape="decay",
         coefficient=-0.2, scale=600.0, low=20.0, high=300.0,
@@ -424,7 +427,7 @@ def test_what_a_term_over_temperature_does_to_cold_pads_is_no_error_of_a_fold():
     assert rmse(force) > 3000.0 and rmse(error) < 1.0
 
 
-def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
+def test_an_unknown_lag_counts_for_speeds_beyond_the_fastest_recorded_clamp():
     found = SimpleNamespace(fit=SimpleNamespace(curves=[SimpleNamespace(travel_rad=20.0)]))
     campaign = SimpleNamespace(datasheet=SimpleNamespace(actuator=SimpleNamespace(max_motor_speed_rad_per_s=200.0)))
     unseen, seen, faster = (noise._unknown_lag(found, campaign, speed) for speed in (0.0, 150.0, 250.0))
@@ -433,7 +436,7 @@ def test_of_an_unknown_lag_counts_what_no_clamp_has_been_fast_enough_to_show():
 
 @pytest.mark.parametrize(("share", "searched"), [(0.3, False), (0.8, True)])
 def test_without_random_motion_a_campaign_is_searched_where_it_clamps_fast(monkeypatch, share, searched):
-    """Slow motion leaves lag and inertia to the datasheet, and what a search makes of them is none of the brake's."""
+    """Slow motion does not show lag and inertia, and a search would explain their errors by something else."""
     calibration = shipped_calibration()
     speed = share * calibration.motor.maximum_speed_rad_per_s * np.array([0.0, 1.0, 1.5])
     drive = SimpleNamespace(samples={"speed": speed}, force_N=np.array([0.0, 5e3, 0.0]))
@@ -467,8 +470,9 @@ def test_curves_whose_compliance_grows_straight_are_predicted_exactly():
     assert errors.shape == (2,) and np.all(errors < 1e-9)
 
 
-def test_one_curve_is_as_unsure_of_other_pads_as_compliance_may_grow_with_them():
-    """Half as thick again is up to half as soft again: from nothing to that, as likely as not; its own pads it knows."""
+def test_a_single_curve_is_unsure_of_other_pads_by_how_compliance_may_grow():
+    """Pads half as thick again are up to half as soft again, uniformly distributed from nothing on; for the measured thickness
+    the error is zero."""
     curve = CurveFit(8.0, np.array([300.0, 40.0, 0.8]), np.eye(3), np.zeros(1), np.ones(1), 18.0)
     only = ThicknessStep(curves=[curve], left_out=np.array([]))
     assert only.interpolation_error(8.0) == 0.0

@@ -137,9 +137,9 @@ def test_pads_and_disc_are_found_within_three_sigma(seed):
     fit = fit_heat(_campaign(truth, rng), START)
     off = {key: (fit.values[key] - value_of(brake, key)) / fit.sigmas[key] for key in UNKNOWNS}
     assert max(map(abs, off.values())) < 3.0, off
-    # An honest sigma is small where the logs speak: the disc is weighed to a per cent.
+    # Sigma is small for what the logs show: the disc's heat capacity is found to a per cent.
     assert fit.sigmas["thermal.disc.heat_capacity_J_per_K"] < 0.02 * brake.thermal.disc.heat_capacity_J_per_K
-    # What both models say of a log that fitted nothing.
+    # On a log that was not fitted.
     r, _ = run_plant(truth, *_cooling(12.0, 200.0, 200.0))
     assert rmse(simulate(to_parameters(moved(START, fit.values)), r)[:, :8] - r.measured[:8].T) < 0.3
 
@@ -166,8 +166,8 @@ def _disc_alone(truth, scenario, folder, name):
     return recording(load_log(folder / f"{name}.csv", read=Mapping(folder / "mapping.yaml").read))
 
 
-def test_a_disc_that_was_measured_alone_tells_of_the_disc(tmp_path):
-    """Its law is found, also from a warm start; what the pads are stays the datasheet's, since nothing shows it."""
+def test_a_disc_that_was_measured_alone_gives_the_disc_alone(tmp_path):
+    """Its cooling law is found, also from a warm start; pad values keep the datasheet's."""
     truth = to_parameters(_draw(np.random.default_rng(9)))
     scenarios = {"drag": _drag(420.0), "slow": _cooling(6.0), "fast": _cooling(36.0), "unseen": _cooling(18.0, 200.0)}
     *fitted, unseen = (_disc_alone(truth, scenario, tmp_path, name) for name, scenario in scenarios.items())
@@ -207,7 +207,7 @@ def test_the_disc_cools_faster_the_faster_it_turns():
 
 
 def test_logs_without_a_release_say_so():
-    """What only a release can tell stays where it started, and is named."""
+    """Values that only a release shows keep their starting value and are named."""
     rng = np.random.default_rng(4)
     fit = fit_heat([run_plant(to_parameters(_draw(rng)), *_drag(300.0), 0.25, rng)[0]], START)
     assert "thermal.pad.gap_conductance_W_per_m2K" in _unexcited(fit)
@@ -381,7 +381,7 @@ def test_a_constant_at_a_heat_port_is_what_its_base_parameters_do(port, keys):
 
 @pytest.mark.parametrize("port", ["disc_heat", "pad_heat"])
 def test_heat_beside_friction_is_stored_or_lost(port):
-    """Nothing braked and nothing lost: the whole of it is in the disc and the pads."""
+    """Without braking and losses all of the heat is stored in disc and pads."""
     insulated = dict.fromkeys([key for key in UNKNOWNS if "cooling" in key or "backplate" in key or "radiating" in key], 1e-12)
     calibration = moved(_with(_term(port, 200.0)), insulated | {"thermal.pad.conductivity_rise_per_K": 0.0})
     still = np.zeros(round(300.0 / STEP_S))
@@ -418,7 +418,7 @@ def test_a_term_is_wanted_for_half_a_kelvin_that_lasts_and_not_for_what_thermoco
     assert grammar._wanted(Selection(model, screening), "temperature") is wanted
 
 
-def test_what_a_fit_of_the_heat_balance_leaves_on_its_way_is_no_term_s():
+def test_the_residual_of_a_heat_fit_that_has_not_converged_is_no_term():
     """From a start that is far off the first fit leaves 1.4 K."""
     off = {
         "disc.cooling_per_speed_J_per_rad_K": 1.6,
@@ -443,17 +443,17 @@ def test_a_term_is_made_for_a_cooling_that_is_no_line_over_the_speed_and_none_fo
     assert not find_terms(_hidden(_bent(0.0), rng), START)[0]
 
 
-def test_what_is_left_of_the_temperatures_is_said_where_no_term_is_made(monkeypatch):
+def test_the_remaining_temperature_error_is_reported_where_no_term_is_made(monkeypatch):
     monkeypatch.setattr(grammar, "_one_more", lambda selection, _: selection)
     terms, left_K, follows = find_terms(_hidden(_bent(1.0), np.random.default_rng(5)), START)
     assert not terms and left_K > 2.0 and follows == "disc_speed"
 
 
-def test_temperatures_are_doubted_where_a_heat_term_is_outside_of_its_range():
+def test_temperature_sigma_grows_where_a_heat_term_is_outside_of_its_range():
     count = round(20.0 / CYCLE_S)
     samples = np.zeros(count, SAMPLE)
     samples["dt"], samples["brake_torque"], samples["current_q"] = CYCLE_S, np.nan, np.nan
-    # Long on the bus: a start that is warmer than its surroundings is doubted by itself.
+    # Long after power-on: shortly after it, plates that are warmer than ambient make sigma larger by themselves.
     samples["cycle"] = 1000 + np.arange(count)
     for name in ("inner_backplate", "outer_backplate", "caliper"):
         samples[name] = 80.0

@@ -122,7 +122,8 @@ def test_bounds_hold():
 
 
 def test_a_prior_weighs_as_much_as_it_says():
-    """Data and prior of equal information meet half way; a parameter that only its prior knows keeps that prior's sigma."""
+    """Data and prior of equal information give the mean of both; a parameter that only its prior determines keeps the prior's
+    sigma."""
     block = Block(lambda v: np.repeat(v["a"] - 2.0, 100), ("a",), np.arange(100))
     found = fit([block], {"a": Free(0.0, 1e-3, prior=(0.0, 0.1)), "b": Free(5.0, 1e-3, prior=(5.0, 0.7))})
     assert found.values == pytest.approx({"a": 1.0, "b": 5.0})
@@ -130,7 +131,7 @@ def test_a_prior_weighs_as_much_as_it_says():
     assert found.sigmas["b"] == pytest.approx(0.7)
 
 
-def test_what_nothing_tells_has_an_infinite_sigma():
+def test_what_neither_data_nor_prior_determine_has_an_infinite_sigma():
     block = Block(lambda v: np.array([v["a"] - 1.0, v["a"] - 1.1]), ("a", "b"), np.arange(2))
     found = fit([block], {"a": Free(0.0, 1e-3), "b": Free(5.0, 1e-3)})
     assert found.values == pytest.approx({"a": 1.05, "b": 5.0})
@@ -207,8 +208,8 @@ def test_an_rmse_is_computed_in_one_module():
     assert found == {"emb_daemon/offline/score.py"}
 
 
-def test_a_fit_asks_nothing_twice():
-    """Its time is that of residuals."""
+def test_a_fit_evaluates_nothing_twice():
+    """Evaluating residuals is what a fit takes its time for."""
     asked, data = [], np.exp(0.7) + np.zeros(50)
 
     def residual(v):
@@ -220,7 +221,7 @@ def test_a_fit_asks_nothing_twice():
 
 
 def test_blocks_of_a_fit_run_side_by_side_to_the_same_values():
-    """Two cores: the residuals of one log wait for those of the other, which would never come one after the other."""
+    """The residuals of each log wait for those of the other, so that the fit ends only if both run at a time."""
     both = threading.Barrier(2, timeout=30.0)
 
     def block(target):

@@ -126,7 +126,7 @@ def test_force_controller_brings_the_true_force(bare, force):
 
 
 def test_pads_that_lose_contact_do_not_pull(calibration):
-    """What pads lose while they are held is missing when they are released."""
+    """The force that pads lose to relaxation while they are held is missing when they are released."""
     effects = {name: {} for name in calibration.effects} | {"clamp_creep": {"share": -0.1, "time_constant_s": 5.0}}
     plant = plant_from_calibration(calibration, effects=effects)
     schedule = drives.rig_stop(8000.0, 0.0, 5.0, 6.0)
@@ -281,7 +281,7 @@ def test_the_daemons_estimator_follows_a_unit_it_was_not_calibrated_on(calibrati
 
 
 def test_a_flickering_resolver_does_not_wear_friction_away(calibration):
-    """A converter without hysteresis flickers between two counts; held forces must not drift for it."""
+    """With a converter without hysteresis, which flickers between two counts, held forces must not drift."""
     plant = plant_from_calibration(calibration, seed=1)
     plant["angle_hysteresis"], plant["angle_noise"] = 0.0, 0.2 * plant["angle_count"]
     frames, truth = scenarios.simulate_log(plant, scenarios.city_drive(), seed=1)
@@ -404,7 +404,7 @@ def campaign(calibration):
 
 @pytest.mark.parametrize("effect", REGISTRY, ids=lambda effect: effect.name)
 def test_an_estimator_that_knows_the_effect_is_as_good_as_without_it(calibration, campaign, effect):
-    """Plant and catalogue were written apart: where they agree, an effect means the same in both."""
+    """Plant and catalogue are separate code: where they agree, an effect means the same in both."""
     values = VISIBLE[effect.name]
     plant = plant_from_calibration(calibration, effects={effect.name: values})
     frames, truth = scenarios.simulate_log(plant, campaign, seed=3)

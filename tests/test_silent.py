@@ -1,4 +1,4 @@
-"""The judge of the study of silent errors: each promise is kept by an honest estimate and broken by a lie of its own kind."""
+"""The judge of the study of silent errors: a correct estimate keeps every promise, and each is broken by one kind of error."""
 
 import msgspec
 import numpy as np
@@ -53,7 +53,7 @@ def failed(rows, **promised):
     return judge("all", TIME_S, rows, FORCE_N, **promised).failed
 
 
-def test_an_honest_estimate_keeps_every_promise(honest):
+def test_a_correct_estimate_keeps_every_promise(honest):
     assert failed(honest, useful=0.99, rmse_N=35.0) == ()
 
 
@@ -94,7 +94,7 @@ def test_what_is_no_number_is_beyond_every_limit(honest):
     assert failed(honest) == ("silent beyond 3 sigma", "silent beyond 1 kN", "usable beyond 3 sigma")
 
 
-def test_a_fat_sigma_and_a_flag_are_no_answer(honest):
+def test_a_large_sigma_or_a_flag_is_not_useful(honest):
     honest["sigma"][:60] = 301.0
     assert failed(honest, useful=0.99) == ("useful",)
     honest["sigma"], honest["mode"][:60] = 30.0, DEGRADED
@@ -160,7 +160,7 @@ def test_every_family_draws_a_fault_within_the_drive(moments, name):
 
 @pytest.mark.parametrize("name", sorted(unlisted.FAMILIES))
 def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(moments, frames, name):
-    """Else E2E protection would refuse them, and nothing would be learned of the estimator."""
+    """Otherwise E2E protection would refuse the frames before they reach the estimator."""
     frames = frames[default_layout()[0]["slot"][frames["can_id"]] >= 0]
     for seed in range(5):
         fault, time_s = unlisted.FAMILIES[name](np.random.default_rng(seed), moments, Size()), moments["park"]
@@ -171,7 +171,7 @@ def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(mo
 
 
 def test_a_brake_with_a_disc_of_its_own_has_the_one_that_its_calibration_is_given():
-    """Where the wheel's phase is the question, nothing may be wrong before the fault."""
+    """In studies of the wheel's phase nothing may be wrong before the fault."""
     uneven = {"disc_thickness_variation": {"order_1_sine_um": -15.0}}
     _, _, calibration, car, _ = prepare(("wheel_pulses_pause",), 0, 1, brake_of(None)._replace(effects=uneven, unit=1))
     for name, value in calibration.effects["disc_thickness_variation"].items():
@@ -196,7 +196,8 @@ def test_a_drive_comes_back_from_its_seed():
 
 
 def test_pads_that_have_moved_are_where_the_training_stroke_found_them():
-    """By 143 um between two drives: the filter, sure of where they were by half a micrometre, would keep 4.2 kN of error."""
+    """They moved by 143 um between two drives: the filter, which had known them to half a micrometre, would keep an error of
+    4.2 kN."""
     _, _, estimates, force_N = drive(("contact_jump",), 3, 1)
     accepted = np.flatnonzero(np.diff((estimates["adapt_result"] == RESULT_ACCEPTED).astype(int)) > 0)[-1]
     after = slice(accepted + 1, accepted + 500)
