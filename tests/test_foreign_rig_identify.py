@@ -127,7 +127,7 @@ def test_sigma_covers_a_force_that_collapses_and_rises_again(tmp_path, capsys, m
 
 def _dome(tmp_path, *names: str) -> None:
     """A dome that collapses and is then pressed flat, recorded once for each of the tables named."""
-    time_s = 0.01 * np.arange(4000)
+    time_s = 0.01 * np.arange(2100)
     angle = 4.0 * (1.0 - np.cos(np.pi * time_s / 10.0)) * (time_s < 20.0)
     given = [0.0, 3.8, 5.0, 4.6, 2.4, 1.9, 2.7, 12.0]
     force = 1000.0 * pchip_interpolate([0.0, 1.0, 2.0, 3.2, 5.0, 6.0, 7.2, 8.0], given, angle)

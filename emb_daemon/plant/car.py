@@ -419,7 +419,8 @@ class Car:
         """One 4 ms cycle under COMMAND rows (one per corner) and a DRIVE record.
 
         Returns the cycle's frames in order of time, as a FRAME array valid until the next call."""
-        count = _tick(self._world, self._rng, commands, drive, self._frames, self.truth)
+        # As a run of one cycle: a kernel of its own would be compiled with all of the plant in it again.
+        count = _run(self._world, self._rng, commands[None], drive.reshape(1), self._frames, self.truth[None])
         return self._frames[:count]
 
     def run(self, commands: np.ndarray, drives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
