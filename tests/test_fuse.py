@@ -76,9 +76,11 @@ def test_the_noise_of_a_torque_is_that_of_both_speeds_and_of_what_is_apart_in_ti
 
 
 def test_an_angle_that_is_late_leaves_open_what_the_motor_gained_meanwhile(p, s, m):
-    """Half of the acceleration times the age squared, by the slope."""
+    """Half of the acceleration times the age squared, by the slope; nothing at a constant speed."""
     prompt = fuse._spread(s, p, m)
-    s["late"], m["speed"] = 0.006, 60.0
+    s["late"] = 0.006
+    assert fuse._spread(s, p, m) == prompt
+    m["speed"] = 60.0
     open_N = 0.5 * 0.006**2 * (20.0 / CYCLE_S) * 900.0 * 1.3
     assert fuse._spread(s, p, m) ** 2 - prompt**2 == pytest.approx(open_N**2)
     p["stiffness_relative_sigma"] = p["thermal"]["softening"] = s["late"] = 0.0

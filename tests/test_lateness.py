@@ -407,27 +407,6 @@ def test_what_the_calibration_knows_or_holds_for_exact_is_not_undone(parameters,
     assert s["late"] == 0.0
 
 
-def test_what_a_late_angle_leaves_open_counts_while_the_speed_changes(parameters, s):
-    """The way of the speed gained meanwhile, 0.5 a t^2, on the stiffness."""
-    p, m = parameters[0], _turning(parameters[0])
-    s["slope"], s["gear_slope"] = 1000.0, 1.0
-    without = fuse._spread(s, p, m)
-    s["late"] = 0.009
-    more = np.sqrt(fuse._spread(s, p, m) ** 2 - without**2)
-    assert more == pytest.approx(0.5 * 0.009**2 * (100.0 / 0.004) * 1000.0)
-    s["speed"] = 100.0
-    assert fuse._spread(s, p, m) == without
-
-
-def test_a_current_that_changes_meanwhile_is_of_another_angle(parameters, s):
-    """By what it changes in the time that the angle is late, beside a third of a sample that they are apart anyway."""
-    p, m = parameters[0], _turning(parameters[0])
-    s["had_current"], m["current_q"] = True, 20.0
-    speeds = fuse._moving_variance(s, p, m) - (0.3 * p["torque_constant"] * 20.0) ** 2
-    s["late"] = 0.004
-    assert fuse._moving_variance(s, p, m) - speeds == pytest.approx((1.3 * p["torque_constant"] * 20.0) ** 2)
-
-
 @pytest.mark.parametrize(
     ("late_s", "filtered_s", "told"), [(0.0079, 0.0, False), (0.0081, 0.0, True), (0.0, 0.047, False), (0.0, SLOWEST_S, True)]
 )
