@@ -105,6 +105,9 @@ event.register("numba:compile", _compilations)
 _private: tempfile.TemporaryDirectory | None = None
 
 config.CACHE_DIR = str(_cache_folder())
+# numba describes the arguments to every pass of its compiler, and would collect every field of a record for it: an eighth of
+# the time to compile. The name says the same.
+types.Record.__repr__ = types.Type.__repr__
 # fastmath stays off: without fused multiply-add a replay is equal on every machine.
 _OPTIONS = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import processkit
 import pytest
-from numba import types
+from numba import typeof, types
 
 import emb_daemon
 from emb_daemon.ahead.library import installed_digest, source_digest
 from emb_daemon.estimator.fuse import fuse, take_sides
+from emb_daemon.estimator.records import new_state
 from emb_daemon.jit import njit
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.runtime.daemon import _compile_fusion
@@ -85,6 +86,12 @@ def test_functions_that_only_kernels_call_are_translated_with_them():
     is_translated = kernel.codegen._engine.is_symbol_defined
     assert is_translated(kernel.fndesc.llvm_func_name)
     assert not any(is_translated(part.fndesc.llvm_func_name) for part in parts)
+
+
+def test_a_record_is_described_by_its_name():
+    """Which is made once; numba asks for it in every pass of every function."""
+    state = typeof(new_state()[0])
+    assert repr(state) is state.name
 
 
 def test_what_the_daemon_compiles_beside_the_estimator_is_what_the_estimator_calls(shipped_setup):
