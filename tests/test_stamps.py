@@ -144,9 +144,9 @@ def test_seconds_and_their_parts_in_two_columns_are_one_time(tmp_path, capsys, m
 def test_what_does_not_begin_anew_with_each_second_is_no_part_of_it(tmp_path, capsys, beside):
     """A clock of whole seconds beside a count: its rows are spread evenly as ever."""
     row = np.arange(2000)
-    count = {"falling": 999 - row % 50 * 20, "slow": row // 2, "signed": row % 50 * 20 - 1, "absent": row % 50 // 30 * 900}[
-        beside
-    ]
+    within = row % 50
+    counts = {"falling": 999 - within * 20, "slow": row // 2, "signed": within * 20 - 1, "absent": within // 30 * 900}
+    count = (counts | {"rolling": row % 1000})[beside]
     lines = "".join(f"{r // 50},{c},{0.04 * r:.3f}\n" for r, c in zip(row, count, strict=True))
     (tmp_path / "a.csv").write_text("t,count,angle\n" + lines)
     (tmp_path / "m.yaml").write_text(
