@@ -1331,6 +1331,23 @@ def test_a_current_whose_number_was_full_is_told_by_the_load_that_goes_on(limit_
     )
 
 
+def test_a_full_number_goes_almost_from_end_to_end_between_rare_samples():
+    """The rest passes up to 13 % of the range within a sample here; what falls by less of it was lost and not full."""
+    time_s, rows = np.arange(24_000) / 300.0, slice(0, None, 40)
+    needed = 20.0 * np.sin(2.1 * time_s) + 14.0 * np.sin(0.9 * time_s)
+    told = {name: Series(s.time_ns[rows], s.values[rows]) for name, s in _driven(needed).items()}
+    beyond = np.abs(needed) > 22.0
+    full = np.where(beyond, needed - 44.0 * np.sign(needed), needed)[rows]
+    ends = np.abs(np.diff(full))[np.diff(beyond[rows].astype(int)) != 0]
+    assert 0.8 < np.min(ends) / np.ptp(full) < 0.9
+    found = overflown(Series(told["current"].time_ns, full), told["speed"], told["force"])
+    assert np.array_equal(found, beyond[rows] | (full == full.max()) | (full == full.min()))
+    lost = np.where(np.abs(needed) > 25.0, needed - 35.0 * np.sign(needed), needed)
+    told = _driven(needed)
+    assert 0.6 < np.max(np.abs(np.diff(lost))) / np.ptp(lost) < 0.8
+    assert not np.any(overflown(Series(told["current"].time_ns, lost), told["speed"], told["force"]))
+
+
 @pytest.mark.parametrize("follows", [True, False], ids=["load follows", "load of its own"])
 def test_a_current_that_is_turned_round_at_once_was_no_larger(follows):
     turned = 20.0 * np.where(np.sin(4.0 * np.arange(9000) / 300.0) > 0.0, 1.0, -1.0)
