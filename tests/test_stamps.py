@@ -311,6 +311,23 @@ def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
     assert _read(tmp_path, columns).samples["has_current"].any()
 
 
+def test_a_brake_that_is_said_to_be_released_has_no_force(tmp_path, capsys):
+    """Where a log begins under force its first angle is no released one, whatever a mapping says."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=6.0)), 250.0)
+    released = re.sub(r"VEH_Status.(ParkBrake|BrakeRequest): .*", r"VEH_Status.\1: {value: 0}", foreignkit.COLUMNS)
+    rows = slice(int(np.argmax(columns["force_N"])), None)
+    clamped = {name: values[rows] for name, values in columns.items()}
+    for log, mapping, said in (
+        (clamped, released, True),
+        (columns, released, False),
+        (clamped, re.sub(r"  VEH_Status.*\n", "", released), False),
+        (clamped, re.sub(r"(ParkBrake): .*", r"\1: {value: 1}", released), False),
+        (clamped | {"force_N": clamped["force_N"] + 60_000.0}, released, False),
+    ):
+        _read(tmp_path, log, mapping)
+        assert ("ClampForceRef begins at" in capsys.readouterr().err) == said
+
+
 @pytest.mark.parametrize("motion", ["on", "late", "yields", "to and fro"])
 def test_a_load_that_no_angle_tells_is_of_no_other_time(tmp_path, capsys, motion):
     """A shaft that another motor brakes in steps: it turns on; begins to turn at the end; yields to each step 40 ms later; or
