@@ -48,7 +48,8 @@ def test_the_page_tells_what_is_left_where_it_has_nothing_to_draw_it_over(channe
         screening=SimpleNamespace(initial={channel: samples}, signals=columns), at_first={},
         model=SimpleNamespace(residual={channel: samples}),
     )  # fmt: skip
-    told = SimpleNamespace(left={channel: left}, selection=selection, unexplained=left, bench=SimpleNamespace(own_data=False))
+    bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=None))
+    told = SimpleNamespace(left={channel: left}, selection=selection, unexplained=left, bench=bench)
     written = Page("", "")
     _left(written, told)
     assert signal.replace("_", " ") in written.render()
