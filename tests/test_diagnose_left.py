@@ -21,7 +21,7 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.selection import Selection
 from emb_daemon.diagnose.signals import MANOEUVRES, smooth_basis
-from emb_daemon.diagnose.text import verdict
+from emb_daemon.diagnose.text import least_left, verdict
 from emb_daemon.diagnose.unexplained import Dependence, Left, achieved, noise_of_means
 from emb_daemon.effects.stribeck_friction import EFFECT
 from emb_daemon.effects.terms import SIGNALS
@@ -48,7 +48,8 @@ def test_the_page_tells_what_is_left_where_it_has_nothing_to_draw_it_over(channe
         screening=SimpleNamespace(initial={channel: samples}, signals=columns), at_first={},
         model=SimpleNamespace(residual={channel: samples}),
     )  # fmt: skip
-    told = SimpleNamespace(left={channel: left}, selection=selection, unexplained=left, bench=SimpleNamespace(own_data=False))
+    bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=None))
+    told = SimpleNamespace(left={channel: left}, selection=selection, unexplained=left, bench=bench)
     written = Page("", "")
     _left(written, told)
     assert signal.replace("_", " ") in written.render()
@@ -201,6 +202,14 @@ def test_what_is_left_names_a_signal_only_for_a_share_worth_a_word(share, named)
 @pytest.mark.parametrize(("rms", "present"), [(50.0, False), (70.0, True)])
 def test_what_is_left_is_held_against_what_the_calibration_achieved(rms, present):
     assert Left("stiffness", rms, 41.0, 0.3, ()).present is present
+
+
+@pytest.mark.parametrize(("own_data", "measured"), [(True, True), (False, True), (False, False)])
+def test_nothing_was_achieved_by_a_calibration_that_nobody_measured(calibration, own_data, measured):
+    """The page on rigs of one's own takes out the provenance of the calibration that is shipped."""
+    known = calibration if measured else msgspec.structs.replace(calibration, provenance=None)
+    told = least_left(SimpleNamespace(bench=SimpleNamespace(own_data=own_data, calibration=known)))
+    assert ("achieved on its own data" in told) == (measured and not own_data) and ("noise" in told) != ("achieved" in told)
 
 
 def test_what_the_calibration_achieved_is_its_figure_unless_its_noise_is_more(calibration):

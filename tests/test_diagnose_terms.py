@@ -196,6 +196,18 @@ def test_where_a_log_leaves_the_range_of_a_term_is_said(calibration):
     assert "pad temperature is outside the range in which term:product was found" in told and "the range 21 °C" in told
 
 
+def test_a_motor_angle_is_the_same_wherever_a_log_begins(calibration):
+    """Terms follow the resolver's angle, not what the motor has turned since the log began."""
+    log = log_of(next(drives(calibration, 31, {})))
+    log.samples["angle"] += 200.0
+    bench = Bench([log], calibration)
+    low, high = float(log.samples["angle"].min()), float(log.samples["angle"].max())
+    known = {"shape": "odd_power", "coefficient": 1e-4, "port": "torque", "signal": "motor_angle"}
+    assert outside_range(bench, [Term(name="term:within", low=low, high=high, **known)]) == []
+    [place] = outside_range(bench, [Term(name="term:before", low=0.0, high=high - low, **known)])
+    assert place.reached == pytest.approx((low, high), abs=0.1)
+
+
 def test_a_validation_log_that_leaves_the_range_of_a_term_is_said(calibration, coupled, monkeypatch):
     """A harder stop than any that showed the term: what it does there was never seen."""
     selection, log, another = coupled

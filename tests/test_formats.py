@@ -408,6 +408,52 @@ def test_frames_as_candump_shows_them_and_savvycan_keeps_them(tmp_path, name, te
         read_log(tmp_path / name)
 
 
+_TABLES_OF_FRAMES = {
+    "a viewer's": "time,addr,bus,data\n166.064,0x123,0,0x1122334455667788\n166.074,0x18fef131,1,0xabcd\n",
+    "bytes apart": "Time [ms];Chan;ID;Flags;DLC;D0;D1;D2;D3;D4;D5;D6;D7;Counter\n"
+    "166064,0;0;123;;8;11;22;33;44;55;66;77;88;1\n166074,0;1;18FEF131;X;2;AB;CD;;;;;;;2\n",
+    "a logger's": "# Logger: one\n# Time format: 4\nTimestamp;Type;Channel;ID;Data\n"
+    "20260921T134000064;0;0;123;1122334455667788\n20260921T134000074;1;1;18fef131;abcd\n",
+    "a script's": "timestamp_us\tArbitration_ID\tchannel\tData\n"
+    "1709294400064000\t0x123\tcan0\t11 22 33 44 55 66 77 88\n1709294400074000\t0x18FEF131\tcan1\tAB CD\n",
+}
+
+
+@pytest.mark.parametrize("text", _TABLES_OF_FRAMES.values(), ids=list(_TABLES_OF_FRAMES))
+def test_a_table_whose_header_names_time_id_and_bytes_is_one_of_frames(tmp_path, text):
+    (tmp_path / "x.csv").write_text(text)
+    recorded = read_log(tmp_path / "x.csv")
+    frames = recorded.frames
+    assert frames["can_id"].tolist() == [0x123, 0x18FEF131] and frames["flags"].tolist() == [0, EXTENDED]
+    assert frames["data"].tolist() == [0x8877665544332211, 0xCDAB] and frames["length"].tolist() == [8, 2]
+    assert np.diff(frames["time_ns"]) == pytest.approx(10_000_000, abs=1000)
+    assert recorded.channels[0] != recorded.channels[1]
+    (tmp_path / "x.csv").write_text(text + "what is this\n")
+    with pytest.raises(InputError, match=rf"x\.csv:{text.count(chr(10)) + 1}: not a candump line"):
+        read_log(tmp_path / "x.csv")
+
+
+def test_ids_of_a_table_of_frames_may_be_decimal_and_short_ones_extended(tmp_path):
+    """Of so many hexadecimal ids one has a letter. A frame of CAN FD is longer than eight bytes."""
+    rows = [f"{0.01 * n:.2f},{256 + 7 * n},{n % 2},{'00' * 12 if n == 3 else '01'}" for n in range(9)]
+    (tmp_path / "x.csv").write_text("\n".join(["Time,CAN ID,Extended,Data", *rows]) + "\n")
+    recorded = read_log(tmp_path / "x.csv")
+    frames = recorded.frames
+    assert frames["can_id"].tolist() == [256 + 7 * n for n in range(9)]
+    assert (frames["flags"] & EXTENDED > 0).tolist() == [n % 2 == 1 for n in range(9)] and frames["length"][3] == 12
+    few = "\n".join(["Time,CAN ID,Data", "0.00,100,01", "0.01,200,01"]) + "\n"
+    (tmp_path / "x.csv").write_text(few)
+    assert read_log(tmp_path / "x.csv").frames["can_id"].tolist() == [0x100, 0x200]
+    (tmp_path / "x.csv").write_text("Time,ID,D0,D1\n0.00,100,1,F\n")
+    assert read_log(tmp_path / "x.csv").frames["data"].tolist() == [0x0F01]
+
+
+def test_python_cans_table_has_its_bytes_in_base_64(tmp_path):
+    with can.CSVWriter(tmp_path / "x.csv") as writer:
+        writer.on_message_received(can.Message(timestamp=1.5, arbitration_id=0x123, is_extended_id=False, data=b"\x01\x02"))
+    assert read_log(tmp_path / "x.csv").frames["data"].tolist() == [0x0201]
+
+
 _ASC = """date Mon Jan 1 10:00:00.000 2026
 base hex  timestamps {format}
 no internal events logged

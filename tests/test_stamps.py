@@ -120,6 +120,43 @@ def test_a_counter_that_is_full_and_a_clock_at_midnight_go_on(tmp_path, unit, st
     assert np.abs(log.samples["speed"][5:-5] - 2.0).max() < 0.05
 
 
+@pytest.mark.parametrize("mapped", ["{signal: sec, unit: s}", "{signal: nanosec, unit: ns}"])
+@pytest.mark.parametrize("order", ["sec nanosec", "nanosec sec"])
+def test_seconds_and_their_parts_in_two_columns_are_one_time(tmp_path, capsys, mapped, order):
+    """As ROS writes them, with rows missing for up to some seconds: neither column alone tells when the rest was measured."""
+    time_s = 1.7e9 + 0.02 * np.delete(np.arange(2000), np.r_[200:210, 700:900, 1234])
+    sec, nanosec = np.floor(time_s + 1e-6).astype(int), np.rint(1e9 * np.mod(time_s + 1e-6, 1.0) - 1e3).astype(int)
+    parts = {"sec": sec, "nanosec": np.maximum(nanosec, 0)}
+    rows = zip(*(parts[name] for name in order.split()), 2.0 * (time_s - 1.7e9), strict=True)
+    (tmp_path / "a.csv").write_text(
+        ",".join([*order.split(), "angle"]) + "\n" + "".join(f"{a},{b},{x:.4f}\n" for a, b, x in rows)
+    )
+    (tmp_path / "m.yaml").write_text(
+        f"format: 1\ntime: {mapped}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: angle, unit: rad}}\n"
+    )
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    said = capsys.readouterr().err
+    assert "nanosec is the part of what sec counts" in said and "bunches" not in said
+    assert np.abs(log.samples["angle"] - 2.0 * (1e-9 * log.time_ns - 1.7e9)).max() < 0.01
+
+
+@pytest.mark.parametrize("beside", ["falling", "slow", "signed", "absent", "rolling"])
+def test_what_does_not_begin_anew_with_each_second_is_no_part_of_it(tmp_path, capsys, beside):
+    """A clock of whole seconds beside a count: its rows are spread evenly as ever."""
+    row = np.arange(2000)
+    within = row % 50
+    counts = {"falling": 999 - within * 20, "slow": row // 2, "signed": within * 20 - 1, "absent": within // 30 * 900}
+    count = (counts | {"rolling": row % 1000})[beside]
+    lines = "".join(f"{r // 50},{c},{0.04 * r:.3f}\n" for r, c in zip(row, count, strict=True))
+    (tmp_path / "a.csv").write_text("t,count,angle\n" + lines)
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: angle, unit: rad}\n"
+    )
+    load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    said = capsys.readouterr().err
+    assert "stamps come in bunches, one every 1e+03 ms" in said and "is the part" not in said
+
+
 def test_a_signal_that_is_held_in_a_finer_raster_is_taken_at_its_own_rate(truth, tmp_path):
     """A current of 250 Hz in a table of 1 kHz is a mean over 4 ms, and a force of 25 Hz does not go by steps."""
     fine = foreignkit.sampled(truth, 1000.0)
@@ -272,6 +309,23 @@ def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
     # A motor that stands needs none.
     columns |= {name: 0.0 * columns[name] for name in ("angle_rad", "speed_rad_per_s")}
     assert _read(tmp_path, columns).samples["has_current"].any()
+
+
+def test_a_brake_that_is_said_to_be_released_has_no_force(tmp_path, capsys):
+    """Where a log begins under force its first angle is no released one, whatever a mapping says."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=6.0)), 250.0)
+    released = re.sub(r"VEH_Status.(ParkBrake|BrakeRequest): .*", r"VEH_Status.\1: {value: 0}", foreignkit.COLUMNS)
+    rows = slice(int(np.argmax(columns["force_N"])), None)
+    clamped = {name: values[rows] for name, values in columns.items()}
+    for log, mapping, said in (
+        (clamped, released, True),
+        (columns, released, False),
+        (clamped, re.sub(r"  VEH_Status.*\n", "", released), False),
+        (clamped, re.sub(r"(ParkBrake): .*", r"\1: {value: 1}", released), False),
+        (clamped | {"force_N": clamped["force_N"] + 60_000.0}, released, False),
+    ):
+        _read(tmp_path, log, mapping)
+        assert ("ClampForceRef begins at" in capsys.readouterr().err) == said
 
 
 @pytest.mark.parametrize("motion", ["on", "late", "yields", "to and fro"])
@@ -680,6 +734,37 @@ def test_lines_of_a_serial_port_that_name_their_values_are_a_table(tmp_path, cap
     assert "1 rows with another number of cells than 3 left out" in capsys.readouterr().err
     assert len(samples) > 10_000 and np.ptp(samples["angle"]) == pytest.approx(80.0, rel=0.01)
     assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
+def test_a_line_for_each_signal_is_a_table_of_columns(tmp_path, capsys, named, delimiter):
+    """As numpy saves the matrix that a script has stacked."""
+    time_s = 0.004 * np.arange(1000)
+    signals = {"t": time_s, "angle": 2.0 * time_s, "nothing": np.zeros(1000)}
+    rows = [[*([name] if named else []), *(f"{value:.4f}" for value in values)] for name, values in signals.items()]
+    lines = [delimiter.join(row).replace(*(".", ",") if delimiter == ";" else (".", ".")) for row in rows]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    clock, angle = ("t", "angle") if named else ("column 1", "column 2")
+    (tmp_path / "m.yaml").write_text(
+        f"format: 1\ntime: {{signal: {clock}, unit: s}}\nsignals:\n"
+        f"  EMB_FL_Resolver.MotorAngle: {{signal: {angle}, unit: rad}}\n"
+    )
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    assert f"each of the 3 lines has {1000 + named} cells" in capsys.readouterr().err
+    assert len(log.samples) >= 999 and np.abs(log.samples["angle"] - 2.0 * log.time_s).max() < 1e-3
+
+
+def test_a_table_of_many_columns_and_few_rows_is_none_of_lines(tmp_path, capsys):
+    """The names of its columns are a line, too."""
+    names = ["t", "angle", *(f"cell {n}" for n in range(300))]
+    rows = [[0.02 * n, 0.1 * n, *[0] * 300] for n in range(40)]
+    (tmp_path / "a.csv").write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]))
+    (tmp_path / "m.yaml").write_text(
+        "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: angle, unit: rad}\n"
+    )
+    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    assert "lines has" not in capsys.readouterr().err and log.samples["angle"][-1] > 3.7
 
 
 @pytest.mark.parametrize("decimal", [".", ","])
@@ -1261,6 +1346,23 @@ def test_a_current_whose_number_was_full_is_told_by_the_load_that_goes_on(limit_
     assert np.array_equal(
         found, (np.abs(needed) > limit_A) | (np.abs(full) == limit_A) | (full == full.max()) | (full == full.min())
     )
+
+
+def test_a_full_number_goes_almost_from_end_to_end_between_rare_samples():
+    """The rest passes up to 13 % of the range within a sample here; what falls by less of it was lost and not full."""
+    time_s, rows = np.arange(24_000) / 300.0, slice(0, None, 40)
+    needed = 20.0 * np.sin(2.1 * time_s) + 14.0 * np.sin(0.9 * time_s)
+    told = {name: Series(s.time_ns[rows], s.values[rows]) for name, s in _driven(needed).items()}
+    beyond = np.abs(needed) > 22.0
+    full = np.where(beyond, needed - 44.0 * np.sign(needed), needed)[rows]
+    ends = np.abs(np.diff(full))[np.diff(beyond[rows].astype(int)) != 0]
+    assert 0.8 < np.min(ends) / np.ptp(full) < 0.9
+    found = overflown(Series(told["current"].time_ns, full), told["speed"], told["force"])
+    assert np.array_equal(found, beyond[rows] | (full == full.max()) | (full == full.min()))
+    lost = np.where(np.abs(needed) > 25.0, needed - 35.0 * np.sign(needed), needed)
+    told = _driven(needed)
+    assert 0.6 < np.max(np.abs(np.diff(lost))) / np.ptp(lost) < 0.8
+    assert not np.any(overflown(Series(told["current"].time_ns, lost), told["speed"], told["force"]))
 
 
 @pytest.mark.parametrize("follows", [True, False], ids=["load follows", "load of its own"])

@@ -6,7 +6,7 @@ from emb_daemon import __version__
 from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import Candidate
-from emb_daemon.diagnose.text import NAMES, number, size, title, verdict
+from emb_daemon.diagnose.text import NAMES, least_left, number, size, title, verdict
 from emb_daemon.diagnose.unexplained import Left
 from emb_daemon.effects.terms import CLAMPED_N, SIGNALS
 from emb_daemon.report.figures import ACCENT, MARKS, MODEL, PALE, Panel, Trace, xy_figure
@@ -136,7 +136,7 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
 
 def _left(report: Page, diagnosis: Diagnosis) -> None:
     section = report.section("What is left")
-    least = "what is noise" if diagnosis.bench.own_data else "what the calibration achieved on its own data"
+    least = least_left(diagnosis)
     if diagnosis.unexplained is None:
         section.text(f"Nothing clearly above {least}, and no smooth function of any signal.")
     section.table(

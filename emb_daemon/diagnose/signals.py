@@ -71,7 +71,8 @@ def signals(bench: Bench) -> dict[str, np.ndarray]:
             "brake_torque": torque,
             "disc_speed": wheel,
             "disc_angle": np.mod(wheel_angle(samples), 2.0 * np.pi),
-            "motor_angle": samples["angle"] - samples["angle"][0],
+            # As terms take it: logs that begin elsewhere pass the same teeth.
+            "motor_angle": samples["angle"],
             "motor_speed": samples["speed"],
             "motor_acceleration": _around(samples["speed"], np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])) / (6.0 * CYCLE_S),
             "current": _around(np.nan_to_num(samples["current_q"]), np.full(6, 0.5)),

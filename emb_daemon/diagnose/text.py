@@ -236,15 +236,22 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
         return []
     unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.log}" if left.log else ""
     if left.beyond:
-        size = f"{left.achieved:.3g} {unit}"
-        known = f"{size} are noise" if diagnosis.bench.own_data else f"the calibration achieved {size} on its own data"
-        text = f"Not explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}, where {known}"
+        size = f"{left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}"
+        text = f"Not explained by any known effect: {size}, where {left.achieved:.3g} {unit} are {least_left(diagnosis)}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
     if strongest is None:
         return [f"{text}, which depend on no signal that was recorded.", *_withdrawn(diagnosis, left.channel)]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
     return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}.", *_withdrawn(diagnosis, left.channel)]
+
+
+def least_left(diagnosis: Diagnosis) -> str:
+    """What a residual is held against, in words: errors of a calibration without provenance are stated, not measured."""
+    if diagnosis.bench.own_data:
+        return "what is noise"
+    measured = diagnosis.bench.calibration.provenance is not None
+    return "what the calibration achieved on its own data" if measured else "what the calibration states as noise"
 
 
 def _withdrawn(diagnosis: Diagnosis, channel: str) -> list[str]:

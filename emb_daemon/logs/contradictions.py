@@ -97,6 +97,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
     lines += _find_gaps(own)
     lines += find_command(current) if current is not None else []
+    lines += _find_not_released(force, messages.get("VEH_Status", {})) if force is not None and not bare else []
     lines += _find_staying(angle, force) if angle is not None and force is not None and not bare else []
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
@@ -185,6 +186,19 @@ def _find_staying(angle: Series, force: Series) -> list[str]:
         f"ClampForceRef stays at {force.values[first]:.4g} N for {lasts_s:.3g} s, "
         f"{1e-9 * (force.time_ns[first] - force.time_ns[0]):.4g} s after the first value, while the motor turns by "
         f"{np.ptp(passed):.3g} rad: did the sensor, or its recorder, end there?"
+    ]
+
+
+def _find_not_released(force: Series, status: Signals) -> list[str]:
+    """A line on a log that begins with a force which it loses later, where the vehicle says that the brake is released."""
+    at_start = [s.values[0] if isinstance(s, Series) else s for s in map(status.get, ("ParkBrake", "BrakeRequest"))]
+    begins_N = float(np.median(force.values[:_LEAST_IN_PART]))
+    lowest_N, largest_N = np.quantile(force.values, (0.05, 0.99))
+    if at_start != [0.0, 0.0] or begins_N < _OPEN * largest_N or lowest_N > 0.5 * begins_N:
+        return []
+    return [
+        f"ClampForceRef begins at {begins_N:.4g} N and falls to {lowest_N:.4g} N, while ParkBrake and BrakeRequest say that "
+        "the brake is released: cut off what comes before it is, or leave VEH_Status out"
     ]
 
 

@@ -4,6 +4,8 @@ import re
 from collections.abc import Iterator
 from itertools import pairwise
 
+from emb_daemon.logs.frame_tables import frame_table
+
 #: What candump shows on a terminal with its option for times: ``(seconds)  interface  id   [length]  bytes``.
 _SHOWN = re.compile(
     rb"\s*\((\d+\.\d+)\)\s+(\S+)\s+(?:[RT]X\s[^\[]*?\s)?([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})\s+\[(\d+)\]((?:\s+[0-9A-Fa-f]{2})*)"
@@ -71,7 +73,7 @@ def as_candump(content: bytes) -> bytes | None:
         return b"\n".join(map(_of_terminal, (_summed(content) if back > _GOES_BACK * len(stamps) else content).split(b"\n")))
     if any(map(_PEAK_ROW.fullmatch, content.split(b"\n", _FIRST_LINES)[:_FIRST_LINES])):
         return b"\n".join(_of_peak_table(content.split(b"\n")))
-    return None
+    return frame_table(content)
 
 
 def _summed(content: bytes) -> bytes:

@@ -40,6 +40,9 @@ _MONTHS, _YEAR = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep",
 #: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits or the part of a
 #: second that stands in a column of its own (µs, ns), in its unit; how many ordinary steps may pass meanwhile.
 _CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 10**6, 10**9, 2**32), 10.0
+#: What the part of a unit of time in a column of its own counts to; share of that which it reaches, and of its steps that rise
+#: within one unit and fall at a new one: what is sampled twice a second or more often does.
+_PARTS, _REACHED, _IN_ORDER = (1e3, 1e6, 1e9), 0.4, 0.9
 #: Share of the fewer rows that two columns have in common if they were written together.
 _TOGETHER = 0.5
 #: What separates a channel's name from its group, and the channel of raw frames in bus loggers' files.
@@ -208,6 +211,7 @@ def _table(path: Path, content: bytes, ending: str, names: list[str], clock: str
         table = table.flatten()
     found = {name: place_of(name, table.column_names) for name in names}
     its = found.get(clock)
+    table = table if its is None else _with_parts(path, table, its)
     clocks = [place for place, name in enumerate(table.column_names) if its is not None and name == table.column_names[its]]
     every = {place: f"column {place + 1}" for place in clocks} | {place: name for name, place in found.items()}
     if len(clocks) > 1 and None not in every and {*found} <= {*every.values()}:
@@ -218,6 +222,38 @@ def _table(path: Path, content: bytes, ending: str, names: list[str], clock: str
             there = f"{count} such columns, of which `column N` is one by its place" if count else "no such column"
             raise InputError(f"{path}: {name}: {there}; the table has {some_of(name, table.column_names)}")
     return table.select(list(found.values())).rename_columns(list(found))
+
+
+def _with_parts(path: Path, table, place: int):
+    """The table with whole and part in the column of times at ``place`` if the one beside it has the other of the two, as
+    ROS writes seconds and nanoseconds."""
+    import pyarrow
+
+    for other in (place + 1, place - 1):
+        for whole, part in ((place, other), (other, place)):
+            if 0 <= other < table.num_columns and (size := _part_of(table[whole], table[part])):
+                names = table.column_names
+                tell(f"{path}: {names[part]} is the part of what {names[whole]} counts: times are both together")
+                once = size if place == part else 1.0
+                values = once * table[whole].to_numpy() + once / size * table[part].to_numpy()
+                return table.set_column(place, table.schema.field(place).with_type(pyarrow.float64()), pyarrow.array(values))
+    return table
+
+
+def _part_of(whole, part) -> float:
+    """How many of a column ``part`` make one of ``whole``; 0 where it is not its part."""
+    import pyarrow
+
+    for column in (whole, part):
+        if column.null_count or not (pyarrow.types.is_integer(column.type) or pyarrow.types.is_floating(column.type)):
+            return 0.0
+    units, parts = whole.to_numpy(), part.to_numpy()
+    size = next((size for size in _PARTS if len(parts) and _REACHED * size < np.max(parts) < size), 0.0)
+    if not size or np.min(parts) < 0 or not all(np.all(values == np.rint(values)) for values in (units, parts)):
+        return 0.0
+    steps, anew = np.diff(parts), np.diff(units) != 0
+    both = anew.any() and not anew.all()
+    return size if both and min(np.mean(steps[~anew] > 0), np.mean(steps[anew] < 0)) > _IN_ORDER else 0.0
 
 
 def _of_workbook(path: Path, content: bytes, names: list[str]) -> bytes:

@@ -30,6 +30,8 @@ _LETTERS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "cp932", "cp949"
 #: A value that its line names, as a serial port's text does: ``Time: 5001 Force=3.2 N``; share of the first lines that must
 #: name the same values.
 _LABELLED, _MOSTLY = re.compile(rb"([A-Za-z_]\w*)\s*[:=]\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?=[\s,;|]|$)"), 0.8
+#: Fewest values of a signal that has a line of its own.
+_ACROSS = 200
 #: A line's end before a separator.
 _LEFT_IN_CELLS = re.compile(rb"\r(?=[,;|\t])")
 #: How a trace of a PLC begins, and a time in it.
@@ -70,7 +72,7 @@ def read_text(path: Path, content: bytes, names: list[str]) -> Any:
         content = content.replace(b"\r", b"\n")
     # Where Windows' files of one column each were put side by side, a line's end is left in every cell.
     content = _LEFT_IN_CELLS.sub(b"", content)
-    content = _in_one_line(_unlabelled(_unterminated(_traced(content))))
+    content = _in_one_line(_upright(path, _unlabelled(_unterminated(_traced(content)))))
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", PREAMBLE + _UNITS)[: PREAMBLE + _UNITS]
     ]
@@ -266,6 +268,22 @@ def _unlabelled(content: bytes) -> bytes:
         found = _LABELLED.findall(line)
         result.append(b",".join(value for _, value in found) if tuple(name for name, _ in found) == names else line)
     return b"\n".join(result)
+
+
+def _upright(path: Path, content: bytes) -> bytes:
+    """A table that has a line for each signal, with its name or without, with a column for each; any other text as it is."""
+    lines = [line for line in content.split(b"\n", PREAMBLE) if line.strip()]
+    # The comma last, because it may be decimal.
+    marks = (mark for mark in (";", "\t", "|", ",", " ") if lines and lines[0].count(mark.encode()) >= _ACROSS - 1)
+    if (mark := next(marks, None)) is None or not 1 < len(lines) < PREAMBLE:
+        return content
+    rows = [_cells(line.decode(errors="replace"), mark) for line in lines]
+    if len({*map(len, rows)}) > 1 or not all(_is_number(cell) for row in rows for cell in row[1:] if cell not in _NOTHING):
+        return content
+    tell(f"{path}: each of the {len(rows)} lines has {len(rows[0])} cells: each is taken for a signal")
+    text = io.StringIO()
+    csv.writer(text, delimiter=mark).writerows(zip(*rows, strict=True))
+    return text.getvalue().encode()
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
