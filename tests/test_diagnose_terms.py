@@ -638,6 +638,36 @@ def test_a_term_whose_shape_is_only_nearly_right_is_stated_anew(coupled, monkeyp
     assert found.model.noise("stiffness") < before.model.noise("stiffness")
 
 
+@pytest.mark.parametrize("alike", [(), (("stiffness", ("brake_torque",)),)])
+def test_a_term_over_a_signal_that_is_only_nearly_right_is_stated_anew_where_another_was_as_likely(coupled, alike):
+    """What the wrong one of two signals leaves would look like another term."""
+    [name] = coupled[0].accepted
+    bare = coupled[0].without(name, "to be made again")
+    wrong = max(
+        grammar._search(bare.model, "stiffness").of_means("stiffness", ("friction_power",)), key=lambda p: p.evidence.gain
+    )
+    candidate = dataclasses.replace(
+        coupled[0].candidates[name],
+        effect=made_effect(wrong.form, grammar._name(wrong.form, bare)),
+        evidence=wrong.evidence,
+        signals=("friction_power",),
+        alike=alike,
+    )
+    before = grammar._enter(bare, candidate, wrong.form)
+    assert before.accepted == ["term:stiffness:friction_power"]
+    found = grammar._restated(before, before, "stiffness")
+    if not alike:
+        assert all(made.startswith("term:stiffness:friction_power") for made in found.accepted)
+        return
+    [chosen] = [found.candidates[made] for made in found.accepted]
+    assert (chosen.effect.hook, chosen.effect.signal, chosen.signals) == ("stiffness", "brake_torque", ("brake_torque",))
+    assert (
+        chosen.alike == (("stiffness", ("friction_power",)),)
+        and "cannot tell it from stiffness over friction power" in chosen.reason
+    )
+    assert found.model.noise("stiffness") < before.model.noise("stiffness")
+
+
 def test_of_two_that_stand_for_one_cause_one_stays(monkeypatch):
     """Each says nothing beside the other; what gains least goes, and then the other holds."""
 
