@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
-from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
+from emb_daemon.diagnose.forms import TEMPERATURES, Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, noise_left
 from emb_daemon.diagnose.prospects import (
@@ -32,7 +32,7 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, SHADOW, Candidate
-from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, recalibrate_heat
+from emb_daemon.diagnose.selection import SURE, TOO_LARGE, Selection, find_known, one_round, recalibrate_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import HOOKS
@@ -104,15 +104,19 @@ def _restated(found: Selection, before: Selection, channel: str) -> Selection:
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
-        # Everything else stays as fitted with the term: refitted without it, it would make up for the term, and a single fit
-        # of the new shape does not undo that.
-        refused = replace(candidate, accepted=False, reason="its shape was chosen again")
-        bare = replace(before.noted([refused]), model=before.model.without(before.model.of_effect(name)))
+        bare = _with_room_of(before, name, "its shape was chosen again")
         found = _shortest([*_in_shapes(bare, candidate, channel), *_at_places(bare, candidate, channel), found], channel)
         if found is last:
             further = _in_shapes(before, candidate, channel, _SHAPES)
             found = _shortest([*further, found], channel)
     return found
+
+
+def _with_room_of(selection: Selection, name: str, reason: str) -> Selection:
+    """The selection without a term, to fit another in its place. Everything else stays as fitted with the term: refitted
+    without it, it would make up for the term, and a single fit of the other does not undo that."""
+    refused = replace(selection.candidates[name], accepted=False, reason=reason)
+    return replace(selection.noted([refused]), model=selection.model.without(selection.model.of_effect(name)))
 
 
 def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int | None = None) -> list[Selection]:
@@ -145,6 +149,37 @@ def _at_places(start: Selection, candidate: Candidate, channel: str) -> list[Sel
         )  # fmt: skip
         result += _entered_again(start, there, prospect)
     return result
+
+
+def _with_other_temperatures(found: Selection, name: str, channel: str) -> Selection:
+    """The same, with each other temperature named as equal that describes the residual nearly as shortly, by odds below 99 to
+    1, when it is fitted in place of a term's own. Temperatures move together, and a car estimates them: the screen, linear
+    about a fit without the term, errs by more than they differ."""
+    candidate = found.candidates[name]
+    port, signals = _place(candidate)
+    others = [
+        (port, tuple(other if signal == own else signal for signal in signals))
+        for own in TEMPERATURES if own in signals
+        for other in TEMPERATURES if other not in signals
+    ]  # fmt: skip
+    named = [(where, {*own}) for where, own in candidate.alike]
+    asked = tuple(place for place in others if (port, {*place[1]}) not in named)
+    if not asked:
+        return found
+    bare = _with_room_of(found, name, "another temperature is asked")
+    fitted = _at_places(bare, replace(candidate, alike=asked), channel)
+    lengths = _descriptions([found, *fitted], channel)
+    alike, undecided_N = candidate.alike, candidate.undecided_N
+    for other, length in zip(fitted, lengths[1:], strict=True):
+        if length - lengths[0] < SURE:
+            alike += tuple(_place(other.candidates[made]) for made in other.accepted if made not in bare.accepted)
+            apart = other.model.residual[channel] - found.model.residual[channel]
+            undecided_N = max(undecided_N, found.model.rms(float(apart @ apart), channel))
+    if alike == candidate.alike:
+        return found
+    manoeuvre = _unsure(signals, alike)[1]
+    equals = replace(candidate, alike=alike, confounded_with=_words(*alike[0]), manoeuvre=manoeuvre, undecided_N=undecided_N)
+    return found.noted([equals])
 
 
 def _entered_again(start: Selection, candidate: Candidate, prospect: Prospect) -> list[Selection]:
@@ -350,7 +385,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     if longer or unsure:
         refused = selection.noted([replace(candidate, accepted=False, reason=_NOT_SHORTER if longer else sure)])
         return refused if unsure else replace(refused, longer=found)
-    return found
+    return found if channel == CHANNEL_OF_HEAT else _with_other_temperatures(found, candidate.effect.name, channel)
 
 
 def _is_longer(found: Selection, selection: Selection, channel: str) -> bool:

@@ -25,7 +25,7 @@ _CONFOUNDED = 0.8
 _EQUAL = 0.97
 #: Log-odds, 99 to 1, from which one of two explains what the other does not: the priors have a share in such a difference,
 #: which the jackknife over episodes does not know.
-_SURE = float(np.log(1.0 / Q_VALUE))
+SURE = float(np.log(1.0 / Q_VALUE))
 #: Odds up to which neither of two is more probable, nats: 11 to 10. In a machine without load an offset of the current and an
 #: asymmetry of its friction are the same torque.
 _EVEN = 0.1
@@ -265,7 +265,7 @@ def _settle(model: Model, passed: list[Candidate], shadows: list[Candidate]) -> 
 
     def says(own: Candidate, beside: Candidate) -> bool:
         evidence = model.evidence(own.channel, own.columns, beside.columns, samples)
-        return evidence.p_value < Q_VALUE and evidence.gain > _SURE * scale
+        return evidence.p_value < Q_VALUE and evidence.gain > SURE * scale
 
     asked = [*passed, *shadows]
     gains = {c.effect.name: model.evidence(c.channel, c.columns, samples=samples).gain for c in asked}
@@ -354,7 +354,7 @@ def weigh_confounded(selection: Selection) -> Selection:
         winner, loser = (other, candidate) if better else (candidate, other)
         if better:
             selection = instead
-        selection = selection.noted(_weighed(selection.candidates[winner.effect.name], loser, abs(own - others) > _SURE))
+        selection = selection.noted(_weighed(selection.candidates[winner.effect.name], loser, abs(own - others) > SURE))
     return selection
 
 
