@@ -130,6 +130,22 @@ def test_what_a_fit_has_left_at_nothing_is_no_effect(viscous):
     assert selection.model.of_effect("viscous_friction") and not revise(stuck).accepted
 
 
+def test_what_ends_at_the_bound_of_physics_is_another_cause(viscous):
+    """Of 3e-4 no more than two thirds may be viscous, or all of it."""
+    selection, _, _ = viscous
+    bare = selection.without("viscous_friction", "to ask it again")
+    [viscous_friction] = [effect for effect in REGISTRY if effect.name == "viscous_friction"]
+    [amplitude] = bare.screening.coordinates["viscous_friction"].values()
+    reasons = {}
+    for high in (2e-4, amplitude.high):
+        bare.screening.coordinates["viscous_friction"] = {amplitude.parameter: dataclasses.replace(amplitude, high=high)}
+        [candidate] = bare.screening.test(bare.model, [viscous_friction])
+        asked = bare.entered([candidate])
+        reasons[high] = asked.candidates["viscous_friction"].reason
+        assert (asked.accepted == ["viscous_friction"]) == (high > 2e-4)
+    assert reasons[2e-4] == "viscous_Nms_per_rad = 0.0002 N·m·s/rad is all that physics allows, and too little"
+
+
 def test_what_friction_does_as_it_turns_over_proves_no_effect(viscous, monkeypatch):
     """How friction turns over is modelled roughly: what an effect gains counts only where the motor slides."""
     selection, _, _ = viscous

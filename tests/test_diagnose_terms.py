@@ -650,6 +650,66 @@ def test_a_term_whose_shape_is_only_nearly_right_is_stated_anew(coupled, monkeyp
     assert found.model.noise("stiffness") < before.model.noise("stiffness")
 
 
+@pytest.mark.parametrize("alike", [(), (("stiffness", ("brake_torque",)),)])
+def test_a_term_over_a_signal_that_is_only_nearly_right_is_stated_anew_where_another_was_as_likely(coupled, alike):
+    """What the wrong one of two signals leaves would look like another term."""
+    [name] = coupled[0].accepted
+    bare = coupled[0].without(name, "to be made again")
+    wrong = max(
+        grammar._search(bare.model, "stiffness").of_means("stiffness", ("friction_power",)), key=lambda p: p.evidence.gain
+    )
+    candidate = dataclasses.replace(
+        coupled[0].candidates[name],
+        effect=made_effect(wrong.form, grammar._name(wrong.form, bare)),
+        evidence=wrong.evidence,
+        signals=("friction_power",),
+        alike=alike,
+    )
+    before = grammar._enter(bare, candidate, wrong.form)
+    assert before.accepted == ["term:stiffness:friction_power"]
+    found = grammar._restated(before, before, "stiffness")
+    if not alike:
+        assert all(made.startswith("term:stiffness:friction_power") for made in found.accepted)
+        return
+    [chosen] = [found.candidates[made] for made in found.accepted]
+    assert (chosen.effect.hook, chosen.effect.signal, chosen.signals) == ("stiffness", "brake_torque", ("brake_torque",))
+    assert (
+        chosen.alike == (("stiffness", ("friction_power",)),)
+        and "cannot tell it from stiffness over friction power" in chosen.reason
+    )
+    assert found.model.noise("stiffness") < before.model.noise("stiffness")
+
+
+def test_other_temperatures_are_named_unless_the_odds_are_99_to_1(coupled, monkeypatch):
+    """They move together, and a screen that is linear about a fit without the term does not tell them apart."""
+    selection = coupled[0]
+    [name] = selection.accepted
+    hot = dataclasses.replace(
+        selection.candidates[name], signals=("brake_torque", "disc_temperature"), alike=(), undecided_N=0.0
+    )
+    asked = []
+
+    def fitted(bare, candidate, _):
+        assert name not in bare.accepted and not bare.model.of_effect(name)
+        asked.extend(candidate.alike)
+        effects = {place: dataclasses.replace(hot.effect, name=f"term:{place}") for place in candidate.alike}
+        return [bare.noted([dataclasses.replace(hot, effect=effects[place], signals=place[1])]) for place in effects]
+
+    monkeypatch.setattr(grammar, "_at_places", fitted)
+    monkeypatch.setattr(grammar, "_descriptions", lambda *_: [100.0, 95.0, 104.5, 104.7])
+    equals = grammar._with_other_temperatures(selection.noted([hot]), name, "stiffness").candidates[name]
+    assert asked == [("stiffness", ("brake_torque", f"{where}_temperature")) for where in ("surface", "pad", "caliper")]
+    assert equals.alike == tuple(asked[:2]) and equals.accepted and equals.undecided_N > 0.0
+    assert equals.confounded_with == "stiffness over brake torque times surface temperature"
+    # What is named already, and a term without a temperature, are not asked.
+    asked.clear()
+    known = dataclasses.replace(hot, alike=equals.alike)
+    monkeypatch.setattr(grammar, "_descriptions", lambda *_: [100.0, 104.7])
+    assert grammar._with_other_temperatures(selection.noted([known]), name, "stiffness").candidates[name].alike == equals.alike
+    assert asked == [("stiffness", ("brake_torque", "caliper_temperature"))]
+    assert grammar._with_other_temperatures(selection, name, "stiffness") is selection
+
+
 def test_of_two_that_stand_for_one_cause_one_stays(monkeypatch):
     """Each says nothing beside the other; what gains least goes, and then the other holds."""
 

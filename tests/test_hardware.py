@@ -4,6 +4,7 @@ import dataclasses
 import re
 from types import SimpleNamespace
 
+import brake
 import foreignkit
 import msgspec
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 import emb_daemon
 from emb_daemon.calibration.files import load_calibration, save_calibration
 from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
-from emb_daemon.calibration.types import Provenance
+from emb_daemon.calibration.types import Provenance, to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.diagnose import diagnosis, residuals
 from emb_daemon.diagnose.comparison import errors, whole
@@ -141,6 +142,31 @@ def test_a_constant_is_not_taken_for_larger_because_friction_scatters_the_load()
     plain = np.linalg.lstsq(table, fit.force_N, rcond=None)[0]
     left = judge.force_N - np.column_stack([judge.samples["current_q"], np.sign(judge.samples["speed"])]) @ plain
     assert after < 0.9 * before and after < 1.03 * np.sqrt(np.mean(left**2))
+
+
+def test_a_machine_whose_angles_have_jittered_stamps_of_their_own_shows_its_effect():
+    """Strokes against a torque sensor, with a motor that creeps between them: there its angle differs from its speed by more
+    than that of a standing motor may. Where the runs of a fit take this for another motion of the friction than the step, they
+    differ from it by more than viscous friction does, and nothing is found."""
+    stated, *_ = _on_a_dynamometer(scatter=0.0, load=1.0)
+
+    def log(seed: int):
+        random, time_s = np.random.default_rng(seed), 0.004 * np.arange(6000)
+        strokes = np.repeat(random.uniform(10.0, 25.0, 6), 1000) * np.sin(np.pi * time_s) ** 3
+        speed = np.where(time_s % 4.0 < 2.0, strokes, 2.5 * np.sin(np.pi * time_s))
+        rows, _ = brake.samples(to_parameters(stated), np.cumsum(speed) * 0.004)
+        force = np.repeat(random.normal(0.0, 4000.0, 30), 200)
+        torque = stated.motor.gear_gain_m_per_rad * force + 1e-3 * rows["speed"]
+        angle = np.interp(time_s + random.uniform(-0.003, 0.003, 6000), time_s, rows["angle"])
+        current = rows["current_q"] + torque / stated.motor.torque_constant_Nm_per_A + random.normal(0.0, 0.05, 6000)
+        columns = {"time_s": time_s, "angle_rad": angle, "current_A": current, "force_N": force}
+        return _log(columns, speed_rad_per_s=rows["speed"], current_mean_s=0.0)
+
+    result = diagnose([log(1)], stated, [log(2)])
+    [found] = result.accepted
+    assert found.effect.name == "viscous_friction"
+    assert found.values["viscous_Nms_per_rad"] == pytest.approx(1e-3, rel=0.15)
+    assert result.after.rmse("torque") < 0.5 * result.before.rmse("torque")
 
 
 def test_an_offset_shows_where_a_motor_turns_one_way_and_friction_cannot_be_less_than_none():

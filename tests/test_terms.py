@@ -19,7 +19,7 @@ from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.cli.main import main
 from emb_daemon.diagnose import export
-from emb_daemon.effects import terms
+from emb_daemon.effects import REGISTRY, terms
 from emb_daemon.errors import InputErrors, InvalidValue
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.offline import estimate
@@ -165,7 +165,7 @@ def test_memories_lag_slip_and_respond():
     np.testing.assert_allclose(response, 0.25 * lag, rtol=1e-9)
     # Signals that stay at their edge for ever would make more of it than a friction may lose or gain.
     hot = Term(**base | {"port": "gear_friction", "coefficient": 12.0}, memory="response", memory_scale=2.0, low=0.0, high=1.0)
-    np.testing.assert_allclose(over(hot, x)[10:], np.minimum(24.0 * lag, 2.0), rtol=1e-9)
+    np.testing.assert_allclose(over(hot, x)[10:], np.minimum(24.0 * lag, 3.0), rtol=1e-9)
     np.testing.assert_allclose(
         over(msgspec.structs.replace(hot, coefficient=-12.0), x)[10:], np.maximum(-24.0 * lag, -0.9), rtol=1e-9
     )
@@ -342,19 +342,26 @@ def test_a_calibration_with_a_bad_term_is_refused(calibration, tmp_path, changed
 @pytest.mark.parametrize(
     ("port", "coefficient", "said"),
     [
-        ("gear_friction", 1.9, None),
-        ("gear_friction", 2.1, "reaches 2.1 1, expected 2 at most"),
+        ("gear_friction", 2.9, None),
+        ("gear_friction", 3.1, "reaches 3.1 1, expected 3 at most"),
         ("gear_friction", -0.95, "reaches -0.95 1, expected -0.9 at least"),
         ("gear_gain", 1.9, "expected 0.9 at most"),
     ],
 )
 def test_friction_may_grow_by_more_than_it_may_fall(port, coefficient, said):
-    """No friction is negative, but of three times as much a machine does not become another one."""
+    """No friction is negative, but of four times as much a machine does not become another one."""
     with pytest.raises(InvalidValue, match=said) if said else contextlib.nullcontext():
         constant(port, coefficient)
 
 
-@pytest.mark.parametrize(("port", "least", "most"), [("gear_friction", -0.9, 2.0), ("gear_gain", -0.9, 0.9)])
+def test_a_term_may_be_as_large_as_the_catalogue_s_effects_at_its_port():
+    """Or a cause that is just as physical would only be found at another port."""
+    for effect in REGISTRY:
+        for amplitude in effect.amplitudes if effect.hook == "gear_friction" else ():
+            constant(effect.hook, amplitude.high)
+
+
+@pytest.mark.parametrize(("port", "least", "most"), [("gear_friction", -0.9, 3.0), ("gear_gain", -0.9, 0.9)])
 def test_a_product_is_held_at_what_its_port_may_bear(port, least, most):
     """Two signals are hardly at their largest at once: where they would be, it may be more than a machine has."""
     of = {"port": port, "signal": "clamp_force", "other": "motor_speed", "other_high": 100.0, "low": 0.0, "high": 1e4}

@@ -19,11 +19,12 @@ _MOST_AT = {
 #: Most that it may take from a factor, and add to one that is not in `_GROWS`: a stiffness, a gear gain or a motor constant
 #: twice as large is another machine's.
 _FACTOR = 0.9
-#: Most that it may add to these factors. Friction and times change severalfold with load and temperature, but beyond three
-#: times the nominal value the term would be the larger part. A contact conducts heat nearly in proportion to its pressure, and
-#: air at speed takes ten times as much heat as still air.
+#: Most that it may add to these factors. Friction may grow by as much as the catalogue grants it where a motor breaks away: at
+#: full speed grease resists as much. Times change severalfold with load and temperature, but beyond three times the nominal
+#: value the term would be the larger part. A contact conducts heat nearly in proportion to its pressure, and air at speed
+#: takes ten times as much heat as still air.
 _GROWS = {
-    "gear_friction": 2.0, "relaxation_time": 2.0, "heat_share": 9.0, "contact_conductance": 9.0, "gap_conductance": 9.0,
+    "gear_friction": 3.0, "relaxation_time": 2.0, "heat_share": 9.0, "contact_conductance": 9.0, "gap_conductance": 9.0,
     "disc_cooling": 9.0,
 }  # fmt: skip
 #: Temperature (degC) from which one that multiplies counts.

@@ -18,9 +18,10 @@ from emb_daemon.effects.terms import PORTS, SIGNALS
 #: Temperature (degC) at which a term that follows one is nothing.
 _COLD_C = 20.0
 _MOTOR_HEAT = ("winding_heat", "housing_heat")
-_TEMPERATURES = ("surface_temperature", "pad_temperature", "disc_temperature", "caliper_temperature")
+#: Those that a car estimates, or measures, near the pads.
+TEMPERATURES = ("surface_temperature", "pad_temperature", "disc_temperature", "caliper_temperature")
 _SLOW = (
-    *_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "energy", "time_clamped", "time_since_last_clamp"
+    *TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "energy", "time_clamped", "time_since_last_clamp"
 )  # fmt: skip
 #: Signals by port: states at elastic ports, speeds where something slides.
 _TYPED: dict[str, tuple[str, ...]] = {
@@ -28,10 +29,10 @@ _TYPED: dict[str, tuple[str, ...]] = {
     "motor_angle": ("motor_angle", "current"),
     "stiffness": (*_SLOW, "travel", "clamp_force"),
     "force": ("clamp_force",),
-    "torque_constant": ("current", *_MOTOR_HEAT, *_TEMPERATURES),
+    "torque_constant": ("current", *_MOTOR_HEAT, *TEMPERATURES),
     "torque": ("motor_speed", "motor_angle"),
-    "current": ("energy", *_MOTOR_HEAT, *_TEMPERATURES),
-    "relaxation_time": (*_TEMPERATURES, "clamp_force", "disc_speed", "brake_torque"),
+    "current": ("energy", *_MOTOR_HEAT, *TEMPERATURES),
+    "relaxation_time": (*TEMPERATURES, "clamp_force", "disc_speed", "brake_torque"),
     "pad_friction": (
         "surface_temperature",
         "pad_temperature",
@@ -41,7 +42,7 @@ _TYPED: dict[str, tuple[str, ...]] = {
         "friction_power",
         "energy",
     ),
-    "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *_TEMPERATURES),
+    "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *TEMPERATURES),
     "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", *_MOTOR_HEAT, *_SLOW),
     "heat_share": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "friction_power", "energy"),
     "contact_conductance": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "energy"),
@@ -128,7 +129,7 @@ class Form:
     def is_physical(self, coefficient: float) -> bool:
         """Whether physics allows the coefficient its sign: heat strengthens no magnet."""
         strengthens = coefficient > 0.0 if self.shape != "decay" else coefficient < 0.0
-        return not (strengthens and self.port == "torque_constant" and {*self.signals} <= {*_MOTOR_HEAT, *_TEMPERATURES})
+        return not (strengthens and self.port == "torque_constant" and {*self.signals} <= {*_MOTOR_HEAT, *TEMPERATURES})
 
     @property
     def step(self) -> float:
@@ -192,7 +193,7 @@ def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[
         signals = [signal for signal in _TYPED[port] if signal in covered and signal not in _ALONE]
         for signal, other in permutations(signals, 2):
             low, high = covered[signal]
-            centre, nothing = (_COLD_C if name in _TEMPERATURES else 0.0 for name in (signal, other))
+            centre, nothing = (_COLD_C if name in TEMPERATURES else 0.0 for name in (signal, other))
             most = max(map(abs, covered[other])) if not nothing else covered[other][1]
             farthest = max(abs(low - centre), abs(high - centre))
             if most <= nothing:
@@ -249,7 +250,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         for share in _SCALES:
             yield "none", "decay", share * reach, 0.0, 1.0, 1.0
         return
-    centre = _COLD_C if signal in _TEMPERATURES else 0.0
+    centre = _COLD_C if signal in TEMPERATURES else 0.0
     farthest = max(abs(low - centre), abs(high - centre))
     if HOOKS[port].channel == "temperature":
         # Temperatures are lagged already: no further memory.
@@ -268,7 +269,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         for time in _CREEP_S:
             yield "lag", "odd_power", reach, 0.0, 1.0, time
         return
-    signed = low < 0.0 and signal not in _TEMPERATURES
+    signed = low < 0.0 and signal not in TEMPERATURES
     even = port in ("torque_constant", "gear_friction", "gear_gain") and signed
     for exponent in _EXPONENTS:
         yield "none", "even_power" if even else "odd_power", farthest, centre, exponent, 1.0
@@ -280,7 +281,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         return
     for place in _PLACES:
         yield "none", "onset", width, low + place * width, 1.0, 1.0
-    if signal in (*_TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
+    if signal in (*TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
         for time in _TIMES_S:
             yield "lag", "odd_power", farthest, centre, 1.0, time
     if signal in ("disc_speed", "brake_torque", "friction_power", "clamp_force"):

@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
-from emb_daemon.diagnose.forms import Form, further_numbers, made_effect, places
+from emb_daemon.diagnose.forms import TEMPERATURES, Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
 from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, noise_left
 from emb_daemon.diagnose.prospects import (
@@ -32,11 +32,11 @@ from emb_daemon.diagnose.prospects import (
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import OF_MODEL_FREE, OF_PLACEBO, Q_VALUE, SHADOW, Candidate
-from emb_daemon.diagnose.selection import TOO_LARGE, Selection, find_known, one_round, recalibrate_heat
+from emb_daemon.diagnose.selection import SURE, TOO_LARGE, Selection, find_known, one_round, recalibrate_heat
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.effects import REGISTRY
 from emb_daemon.effects.base import HOOKS
-from emb_daemon.effects.terms import MOST, PORTS, SIGNALS
+from emb_daemon.effects.terms import MOST, PORTS
 from emb_daemon.offline.run import held
 from emb_daemon.offline.score import rmse
 
@@ -95,23 +95,28 @@ def _has_room(selection: Selection, channel: str) -> bool:
 
 
 def _restated(found: Selection, before: Selection, channel: str) -> Selection:
-    """The same, or an earlier term in another shape or of two shapes, if that alone describes the residual as shortly as it
-    does with the last one beside it: where a shape was only nearly right, the rest of it looks like another term."""
+    """The same, or an earlier term in another shape, at a place that was as likely, or of two shapes, if that alone describes
+    the residual as shortly as it does with the last one beside it: where a shape or a signal was only nearly right, the rest
+    looks like another term."""
     last = found
     # Terms of the heat balance were fitted in all their shapes, and a ripple has but one.
     for name in _made(before, channel) if channel != CHANNEL_OF_HEAT else ():
         candidate = before.candidates[name]
         if "sine" in [c.parameter for c in candidate.amplitudes]:
             continue
-        # Everything else stays as fitted with the term: refitted without it, it would make up for the term, and a single fit
-        # of the new shape does not undo that.
-        refused = replace(candidate, accepted=False, reason="its shape was chosen again")
-        bare = replace(before.noted([refused]), model=before.model.without(before.model.of_effect(name)))
-        found = _shortest([*_in_shapes(bare, candidate, channel), found], channel)
+        bare = _with_room_of(before, name, "its shape was chosen again")
+        found = _shortest([*_in_shapes(bare, candidate, channel), *_at_places(bare, candidate, channel), found], channel)
         if found is last:
             further = _in_shapes(before, candidate, channel, _SHAPES)
             found = _shortest([*further, found], channel)
     return found
+
+
+def _with_room_of(selection: Selection, name: str, reason: str) -> Selection:
+    """The selection without a term, to fit another in its place. Everything else stays as fitted with the term: refitted
+    without it, it would make up for the term, and a single fit of the other does not undo that."""
+    refused = replace(selection.candidates[name], accepted=False, reason=reason)
+    return replace(selection.noted([refused]), model=selection.model.without(selection.model.of_effect(name)))
 
 
 def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int | None = None) -> list[Selection]:
@@ -123,11 +128,66 @@ def _in_shapes(start: Selection, candidate: Candidate, channel: str, most: int |
     # Of forms with the same structure the one that gains most: a fit finds the size.
     structures = {replace(p.form, **dict.fromkeys(p.form.fitted, 0.0)): p for p in nearly}
     for prospect in sorted(structures.values(), key=lambda p: -p.evidence.gain)[:most]:
-        effect = made_effect(prospect.form, _name(prospect.form, start))
-        new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
-        other = _enter(start, new, prospect.form) if prospect.evidence.gain > 0.0 else start
-        result += [other] if effect.name in other.accepted else []
+        result += _entered_again(start, candidate, prospect)
     return result
+
+
+def _at_places(start: Selection, candidate: Candidate, channel: str) -> list[Selection]:
+    """A selection with a term at each of the places that are as likely as the candidate's, in the shape that gains most there;
+    of those that gain most, as many as are fitted where the screen cannot tell."""
+    if not candidate.alike:
+        return []
+    search, result = _search(start.model, channel), []
+    best = [max(found, key=lambda p: p.evidence.gain) for place in candidate.alike if (found := search.of_means(*place))]
+    for prospect in sorted(best, key=lambda p: -p.evidence.gain)[: _FITTED - 1]:
+        places, form = (_place(candidate), *candidate.alike), prospect.form
+        alike = tuple(place for place in places if (place[0], {*place[1]}) != (form.port, {*form.signals}))
+        unsure, manoeuvre = _unsure(form.signals, alike)
+        there = replace(
+            candidate, signals=form.signals, over=search.over(form), alike=alike, reason=unsure, manoeuvre=manoeuvre,
+            confounded_with=_words(*alike[0]),
+        )  # fmt: skip
+        result += _entered_again(start, there, prospect)
+    return result
+
+
+def _with_other_temperatures(found: Selection, name: str, channel: str) -> Selection:
+    """The same, with each other temperature named as equal that describes the residual nearly as shortly, by odds below 99 to
+    1, when it is fitted in place of a term's own. Temperatures move together, and a car estimates them: the screen, linear
+    about a fit without the term, errs by more than they differ."""
+    candidate = found.candidates[name]
+    port, signals = _place(candidate)
+    others = [
+        (port, tuple(other if signal == own else signal for signal in signals))
+        for own in TEMPERATURES if own in signals
+        for other in TEMPERATURES if other not in signals
+    ]  # fmt: skip
+    named = [(where, {*own}) for where, own in candidate.alike]
+    asked = tuple(place for place in others if (port, {*place[1]}) not in named)
+    if not asked:
+        return found
+    bare = _with_room_of(found, name, "another temperature is asked")
+    fitted = _at_places(bare, replace(candidate, alike=asked), channel)
+    lengths = _descriptions([found, *fitted], channel)
+    alike, undecided_N = candidate.alike, candidate.undecided_N
+    for other, length in zip(fitted, lengths[1:], strict=True):
+        if length - lengths[0] < SURE:
+            alike += tuple(_place(other.candidates[made]) for made in other.accepted if made not in bare.accepted)
+            apart = other.model.residual[channel] - found.model.residual[channel]
+            undecided_N = max(undecided_N, found.model.rms(float(apart @ apart), channel))
+    if alike == candidate.alike:
+        return found
+    manoeuvre = _unsure(signals, alike)[1]
+    equals = replace(candidate, alike=alike, confounded_with=_words(*alike[0]), manoeuvre=manoeuvre, undecided_N=undecided_N)
+    return found.noted([equals])
+
+
+def _entered_again(start: Selection, candidate: Candidate, prospect: Prospect) -> list[Selection]:
+    """The selection with a candidate in another form, if that holds."""
+    effect = made_effect(prospect.form, _name(prospect.form, start))
+    new = replace(candidate, effect=effect, evidence=prospect.evidence, accepted=False)
+    other = _enter(start, new, prospect.form) if prospect.evidence.gain > 0.0 else start
+    return [other] if effect.name in other.accepted else []
 
 
 def search_heat(bench: warmth.HeatBench) -> Selection:
@@ -214,7 +274,7 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
         bare = selection.without(term, "an effect of the catalogue says the same")
         proven = selection.candidates[term]
         # What acts in the same place and follows the same signal first: most others make up for what the fits do not reach.
-        for known in sorted(find_known(bare, channel), key=lambda c: (c.effect.hook, c.effect.signal) != _place(proven)):
+        for known in sorted(find_known(bare, channel), key=lambda c: (c.effect.hook, (c.effect.signal,)) != _place(proven)):
             known = replace(known, names=term, p_value=proven.p_value, q_value=proven.q_value)
             named = bare.entered([known])
             named = replace(named, model=named.model.arrived(channel))
@@ -224,9 +284,9 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
     return selection
 
 
-def _place(made: Candidate) -> tuple[str, ...]:
+def _place(made: Candidate) -> tuple[str, tuple[str, ...]]:
     """Port and signals of a term."""
-    return made.effect.hook, *made.signals
+    return made.effect.hook, made.signals
 
 
 def _descriptions(selections: Sequence[Selection], channel: str) -> list[float]:
@@ -325,7 +385,7 @@ def _one_more(selection: Selection, channel: str) -> Selection:
     if longer or unsure:
         refused = selection.noted([replace(candidate, accepted=False, reason=_NOT_SHORTER if longer else sure)])
         return refused if unsure else replace(refused, longer=found)
-    return found
+    return found if channel == CHANNEL_OF_HEAT else _with_other_temperatures(found, candidate.effect.name, channel)
 
 
 def _is_longer(found: Selection, selection: Selection, channel: str) -> bool:
@@ -362,11 +422,8 @@ def _with(
     model, screening, channel = selection.model, selection.screening, search.channel
     rivals = _as_good(best, [p for p in prospects if p is not best], shares)
     chance, moved = search.chance(best), search.at_another_time(best.form) / best.evidence.gain
-    unsure, manoeuvre = "", None
-    if rivals:
-        manoeuvre = _manoeuvre(best.form, rivals[0].form)
-        alike = ", ".join(_words(p.form) for p in rivals)
-        unsure = f"these logs cannot tell it from {alike}; to separate them: {manoeuvre}"
+    alike = tuple((p.form.port, p.form.signals) for p in rivals)
+    unsure, manoeuvre = _unsure(best.form.signals, alike)
     ceiling, rival = screening.rival(model, channel, {}, LASTING[channel])
     largest = _largest_beside(selection, best, channel)
     objections = {
@@ -383,9 +440,8 @@ def _with(
         made_effect(best.form, _name(best.form, selection)), channel, evidence=best.evidence, p_value=best.evidence.p_value,
         q_value=chance, gain=model.rms(best.evidence.gain, channel), reason=against or unsure,
         placebos={} if best.form.shape == "harmonic" else {"its signal at another time": max(moved, 0.0)},
-        confounded_with=_words(rivals[0].form) if rivals else None, manoeuvre=manoeuvre,
-        alike=tuple((p.form.port, p.form.signals) for p in rivals), undecided_N=search.undecided(best, rivals),
-        over=np.concatenate(search.signals)[:, list(SIGNALS).index(best.form.signal)], signals=best.form.signals,
+        confounded_with=_words(*alike[0]) if alike else None, manoeuvre=manoeuvre, alike=alike,
+        undecided_N=search.undecided(best, rivals), over=search.over(best.form), signals=best.form.signals,
     )  # fmt: skip
     if against:
         return selection.noted([candidate])
@@ -469,13 +525,18 @@ def _as_good(best: Prospect, others: Sequence[Prospect], shares: Mapping[tuple[s
     return list(found.values())
 
 
-def _words(form: Form) -> str:
-    return f"{form.port} over {' times '.join(form.signals)}".replace("_", " ")
+def _words(port: str, signals: tuple[str, ...]) -> str:
+    return f"{port} over {' times '.join(signals)}".replace("_", " ")
 
 
-def _manoeuvre(form: Form, other: Form) -> str:
-    """What would tell two forms apart: of the same signals only the port, which shows over the force."""
-    return MANOEUVRES[next((signal for signal in form.signals if signal not in other.signals), "clamp_force")]
+def _unsure(signals: tuple[str, ...], alike: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, str | None]:
+    """What is said of a term over some ``signals`` that these logs cannot tell from others (ports and signals), and what would
+    tell it from the first of them: of the same signals only the port, which shows over the force."""
+    if not alike:
+        return "", None
+    manoeuvre = MANOEUVRES[next((signal for signal in signals if signal not in alike[0][1]), "clamp_force")]
+    others = ", ".join(_words(*place) for place in alike)
+    return f"these logs cannot tell it from {others}; to separate them: {manoeuvre}", manoeuvre
 
 
 def _shares(screen: Screen, prospects: Sequence[Prospect]) -> dict[tuple[str, str], float]:

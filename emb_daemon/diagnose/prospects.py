@@ -180,6 +180,10 @@ class Search:
         """What a form of coefficient one does to the channel."""
         return self.sensitivities[form.port] * _values(self.model.bench, form, self.signals)
 
+    def over(self, form: Form) -> np.ndarray:
+        """The signal that a form shapes, at every sample, shape (N,)."""
+        return np.concatenate(self.signals)[:, list(SIGNALS).index(form.signal)]
+
     def _find_gains(self, forms: Sequence[Form]) -> np.ndarray:
         return _screen_forms(self.screen, forms, self.sensitivities, self.signals).gain
 

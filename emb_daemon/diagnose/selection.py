@@ -25,7 +25,7 @@ _CONFOUNDED = 0.8
 _EQUAL = 0.97
 #: Log-odds, 99 to 1, from which one of two explains what the other does not: the priors have a share in such a difference,
 #: which the jackknife over episodes does not know.
-_SURE = float(np.log(1.0 / Q_VALUE))
+SURE = float(np.log(1.0 / Q_VALUE))
 #: Odds up to which neither of two is more probable, nats: 11 to 10. In a machine without load an offset of the current and an
 #: asymmetry of its friction are the same torque.
 _EVEN = 0.1
@@ -128,7 +128,8 @@ class Selection:
         return replace(self.noted([refused]), model=model, dropped=self.dropped | {suspect})
 
     def entered(self, winners: list[Candidate]) -> "Selection":
-        """Effects accepted, one for each channel, and refitted; one that leaves its channel worse than before goes out."""
+        """Effects accepted, one for each channel, and refitted. Out goes one that leaves its channel worse than before, or
+        ends at a bound of what physics allows."""
         before = self.model
         values, chosen, centre = {}, [], {}
         for winner in winners:
@@ -148,7 +149,12 @@ class Selection:
         result = replace(self.noted(replace(winner, accepted=True) for winner in winners), model=model)
         for winner in winners:
             own = [c for c in result.model.of_effect(winner.effect.name) if not is_shape(c)]
-            if result.model.noise(winner.channel) >= before.noise(winner.channel) or result.model.says_nothing(own):
+            limit = next((c for c in own if result.model.is_at_limit(c)), None)
+            if limit is not None:
+                # What these logs ask for lies beyond the bound: another cause, which this effect would keep from being found.
+                stands = f"{limit.parameter} = {result.model.values[limit]:.3g} {limit.unit}"
+                result = result.without(winner.effect.name, f"{stands} is all that physics allows, and too little")
+            elif result.model.noise(winner.channel) >= before.noise(winner.channel) or result.model.says_nothing(own):
                 reason = "no fit of it with the calibration's own parameters is better than without it"
                 result = result.without(winner.effect.name, reason)
         return result
@@ -259,7 +265,7 @@ def _settle(model: Model, passed: list[Candidate], shadows: list[Candidate]) -> 
 
     def says(own: Candidate, beside: Candidate) -> bool:
         evidence = model.evidence(own.channel, own.columns, beside.columns, samples)
-        return evidence.p_value < Q_VALUE and evidence.gain > _SURE * scale
+        return evidence.p_value < Q_VALUE and evidence.gain > SURE * scale
 
     asked = [*passed, *shadows]
     gains = {c.effect.name: model.evidence(c.channel, c.columns, samples=samples).gain for c in asked}
@@ -348,7 +354,7 @@ def weigh_confounded(selection: Selection) -> Selection:
         winner, loser = (other, candidate) if better else (candidate, other)
         if better:
             selection = instead
-        selection = selection.noted(_weighed(selection.candidates[winner.effect.name], loser, abs(own - others) > _SURE))
+        selection = selection.noted(_weighed(selection.candidates[winner.effect.name], loser, abs(own - others) > SURE))
     return selection
 
 
