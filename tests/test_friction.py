@@ -223,13 +223,13 @@ def test_friction_follows_of_a_noisy_angle_what_is_more_than_its_presliding(para
     s, p = new_state()[0], parameters[0]
     s["turned_back"] = noisy
     way = 0.9 * p["presliding_angle"]
-    slid = paths._slid(s, p, way, way, 0.004)
+    slid = paths._slid(s, p, way, way, 0.0, 0.004)
     assert slid == pytest.approx(0.0 if noisy else way - paths.FLICKER_RAD)
     s["turned_back"] = noisy
-    after = paths._slid(s, p, 3.0 * way, 2.0 * way, 0.004)
+    after = paths._slid(s, p, 3.0 * way, 2.0 * way, 0.0, 0.004)
     assert after == pytest.approx(3.0 * way - p["presliding_angle"] if noisy else 2.0 * way)
     # One that stands has not forgotten which way it came.
-    paths._slid(s, p, 3.0 * way, 0.0, 0.004)
+    paths._slid(s, p, 3.0 * way, 0.0, 0.0, 0.004)
     assert s["direction"] == 2.0 * way
 
 

@@ -20,6 +20,7 @@ from emb_daemon.models.gear import GEAR
 from emb_daemon.models.lateness import LATELY, LATENESS
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
+from emb_daemon.models.torque import STEPS
 from emb_daemon.models.wander import WANDER
 
 CURVE_TERMS = 5
@@ -126,6 +127,7 @@ STATE = np.dtype(
         # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late. What
         # effects have ``gained`` of thickness, m, and by how much that ``swelled`` or shrank in this sample.
         *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back gained swelled"),
+        ("steps", STEPS),
         # Way (rad) that the gear has slid since it last turned back, with its sign, and the way before that.
         *fields("f8", "swing swing_before"),
         *fields("f8", "torque_age balance leverage"),
