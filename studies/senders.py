@@ -198,20 +198,37 @@ def every_other_lost(rng, moments, size):
     return Fault(f"{100 * share:.0f} % of {'resolver' if slot == wire.RESOLVER else 'current'}", at, bus=during(bus, at))
 
 
+def _delay(change: Callable) -> Callable:
+    """A bus whose frames come at the later times that ``change(frames)`` gives them."""
+    kept = []
+
+    def bus(frames, _):
+        if not len(frames):
+            return frames
+        until = frames["time_ns"].max()
+        frames = np.concatenate([*kept, change(frames)])
+        frames = frames[np.argsort(frames["time_ns"], kind="stable")]
+        come = frames["time_ns"] <= until
+        kept[:] = [frames[~come]]
+        return frames[come]
+
+    return bus
+
+
 @_family
 def late_in_groups(rng, moments, size):
-    """A gateway collects the resolver's or the current's messages, or both, and sends what it has every so many milliseconds."""
+    """A gateway collects the resolver's or the current's messages, or both, and sends them every so many milliseconds."""
     every, at = draw_size(rng, 0.008, 0.06), pick_sometime(rng, moments)
     which = int(rng.integers(3))
     ids = (ids_of(wire.RESOLVER), ids_of(wire.CURRENT), ids_of(wire.RESOLVER, wire.CURRENT))[which]
 
-    def bus(frames, _):
+    def change(frames):
         rows = np.isin(frames["can_id"], ids)
         step = int(1e9 * every)
         frames["time_ns"][rows] = (frames["time_ns"][rows] // step + 1) * step
-        return frames[np.argsort(frames["time_ns"], kind="stable")]
+        return frames
 
-    return Fault(f"{('resolver', 'current', 'all')[which]}, every {1e3 * every:.0f} ms", at, bus=during(bus, at))
+    return Fault(f"{('resolver', 'current', 'all')[which]}, every {1e3 * every:.0f} ms", at, bus=during(_delay(change), at))
 
 
 @_family
@@ -219,12 +236,12 @@ def stamps_jitter(rng, moments, size):
     """Messages wait for others: each is up to so much later."""
     by, at = draw_size(rng, 0.0005, 0.02), pick_sometime(rng, moments)
 
-    def bus(frames, _):
+    def change(frames):
         rows = np.isin(frames["can_id"], ids_of(wire.RESOLVER, wire.CURRENT))
         frames["time_ns"] += (rows * 1e9 * rng.uniform(0.0, by, len(frames))).astype(np.int64)
-        return frames[np.argsort(frames["time_ns"], kind="stable")]
+        return frames
 
-    return Fault(f"up to {1e3 * by:.1f} ms", at, bus=during(bus, at))
+    return Fault(f"up to {1e3 * by:.1f} ms", at, bus=during(_delay(change), at))
 
 
 @_family
@@ -232,13 +249,12 @@ def twice(rng, moments, size):
     """A loop of gateways: every message comes again, up to some milliseconds later."""
     by, at = draw_size(rng, 0.0002, 0.03), pick_sometime(rng, moments)
 
-    def bus(frames, _):
+    def change(frames):
         again = frames.copy()
         again["time_ns"] += int(1e9 * by)
-        both = np.concatenate((frames, again))
-        return both[np.argsort(both["time_ns"], kind="stable")]
+        return np.concatenate((frames, again))
 
-    return Fault(f"{1e3 * by:.1f} ms later", at, bus=during(bus, at))
+    return Fault(f"{1e3 * by:.1f} ms later", at, bus=during(_delay(change), at))
 
 
 @_family

@@ -71,11 +71,12 @@ PARAMETERS = np.dtype(
 )
 
 #: One row for the estimator. It is a resolver sample, or asks for a prediction ``age_cycles`` after the last
-#: one. ``dt`` s since the last sample; ``cycle`` its number since the first, ``elapsed_cycles`` since the last row;
+#: one. ``dt`` s since the last sample; ``late_ns`` by how much it came later than the promptest; ``cycle`` its number since
+#: the first, ``elapsed_cycles`` since the last row;
 #: ``reasons`` what is amiss outside the estimator. ``brake_torque`` N m is a rig's, NaN in a car.
 SAMPLE = np.dtype(
     [
-        *fields("i8", "time_ns cycle elapsed_cycles age_cycles corner counter reasons"),
+        *fields("i8", "time_ns late_ns cycle elapsed_cycles age_cycles corner counter reasons"),
         ("is_prediction", "?"),
         *fields(
             "f8",
@@ -220,7 +221,7 @@ STATE = np.dtype(
 
 ESTIMATE = np.dtype(
     [
-        *fields("i8", "time_ns cycle elapsed_cycles age_cycles corner counter mode source reasons facts"),
+        *fields("i8", "time_ns late_ns cycle elapsed_cycles age_cycles corner counter mode source reasons facts"),
         ("is_sample", "?"),
         ("engaged", "?"),
         *fields("i8", "adapt_request adapt_progress adapt_result"),
