@@ -9,7 +9,7 @@ from emb_daemon.estimator.uneven import way_per_rad
 from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
-from emb_daemon.models.lateness import friction_since, remember, turned_within
+from emb_daemon.models.lateness import beyond_speeds, friction_since, remember, turned_within
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
 from emb_daemon.models.torque import (
     NOISE_TURNS_BACK,
@@ -40,7 +40,7 @@ _SHORT = 1.0
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
 #: Count of an angle, rad, above which it hides which way friction holds: two of that resolver's.
-_COARSE_RAD = 4.0 * FLICKER_RAD
+COARSE_RAD = 4.0 * FLICKER_RAD
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
 _CREEP_S = (1.0, 8.0)
 #: A time after which everything has settled, s.
@@ -278,8 +278,8 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     age = known + s.late if s.late > 0.5 * CYCLE_S else known
     early = turned_within(s.lately, min(age, 0.0))
     travel = m.angle - s.angle
-    count = resolution(s.steps, travel, 0.5 * (m.speed + s.speed) * m.dt)
-    if count <= _COARSE_RAD:
+    count = resolution(s.steps, travel, beyond_speeds(s.lately, travel, m.dt))
+    if count <= COARSE_RAD:
         count = 0.0
     slid = _slid(s, p, m.angle + early, travel, count, m.dt)
     before, variance = s.friction_state, s.friction_variance

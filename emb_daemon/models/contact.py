@@ -16,13 +16,13 @@ from emb_daemon.jit import Record, fields, njit, sq
 #: ``rise``, ``shortfall``: summed torque above and below that of clearance level and estimated force, in standard deviations
 #: of one sample. ``level``: torque in the clearance, N m, mean of ``samples``. ``early``: torque above the level, N m, mean of
 #: the first ``begun`` samples of this stroke. ``excess``: the same, smoothed over the last ``watched``
-#: samples, and ``spread`` of these, (N m)^2. ``agreed``: number of closing samples that confirm the contact angle.
+#: samples. ``agreed``: number of closing samples that confirm the contact angle.
 CONTACT = np.dtype(
     [
         *fields("?", "engaged lost confirmed"),
         *fields("f8", "level samples early begun rise shortfall"),
         ("agreed", "i8"),
-        *fields("f8", "excess watched spread"),
+        *fields("f8", "excess watched"),
     ],
     align=True,
 )
@@ -99,9 +99,7 @@ def watch_closing(
         return NOTHING
     state.watched = min(state.watched + 1.0, _SMOOTHED)
     level, level_sigma = clearance_level(state, sigma, offset, offset_sigma)
-    apart = torque - predicted - level - state.excess
-    state.excess += apart / state.watched
-    state.spread += (apart * apart * (1.0 - 1.0 / state.watched) - state.spread) / state.watched
+    state.excess += (torque - predicted - level - state.excess) / state.watched
     if friction_mean < _TURNED_OVER:
         state.begun = state.early = 0.0
         return NOTHING
@@ -162,16 +160,14 @@ def forget_level(state: Record) -> None:
 def start_anew(state: Record) -> None:
     """Forget all sums, because the estimated contact angle has changed."""
     state.lost, state.confirmed, state.agreed = True, False, 0
-    state.rise = state.shortfall = state.excess = state.watched = state.spread = 0.0
+    state.rise = state.shortfall = state.excess = state.watched = 0.0
 
 
 @njit
 def clearly_above(state: Record, sigma: float) -> float:
-    """Smoothed excess (N m) that noise does not reach, which is ``sigma`` N m per sample or what these samples show; infinite
-    before they show any."""
-    if state.watched < _BEGINNING:
-        return np.inf
-    return 5.0 * sqrt(max(sigma * sigma, state.spread) / state.watched)
+    """Smoothed excess (N m) that noise of standard deviation ``sigma`` per sample does not reach; infinite before the first
+    sample."""
+    return 5.0 * sigma / sqrt(state.watched) if state.watched > 0.0 else np.inf
 
 
 @njit

@@ -18,11 +18,11 @@ _OF_LATE_S = 0.05
 NOISE_TURNS_BACK = 0.15
 #: Standard deviation of a friction that is anywhere between all and none.
 _BETWEEN = 1.0 / sqrt(3.0)
-#: Number of an angle's steps in which its smallest is looked for. A stroke begins and ends slowly, and has more of them.
+#: Number of an angle's steps in which its count is looked for. A stroke begins and ends slowly, and has more of them.
 _STEPS = 64
 
-#: Steps of an angle, now and in the `_STEPS` before: the ``least`` of them and the ``most`` by which one differed from the way
-#: by the speed, rad.
+#: Steps of an angle, in the ``number`` now and in the `_STEPS` before: the ``least`` of them, and the ``most`` by which one
+#: was beyond what the speeds explain, rad.
 STEPS = np.dtype([("least", "f8", (2,)), ("most", "f8", (2,)), *fields("i8", "number")], align=True)
 
 
@@ -44,16 +44,16 @@ def slid_angle(before: float, angle: float, flicker: float) -> float:
 
 
 @njit
-def resolution(c: Record, travel: float, turned: float) -> float:
-    """Count of the angle, rad, by its steps so far: no less than the smallest, and no more than what an angle was ever apart
-    from the speed. 0 until enough are known.
+def resolution(c: Record, travel: float, unexplained: float) -> float:
+    """Count of the angle, rad, by its steps so far: no more than the least of them, and no more than what was ever beyond the
+    speeds of the motor. 0 until enough are known.
 
-    An angle in fine counts has small steps whenever the motor starts or stops; one that has large steps because the motor goes
-    fast agrees with the speed.
+    An angle in fine counts has small steps whenever the motor starts or stops; one that has none because the motor goes fast
+    or jerks agrees with the speeds.
 
     Args:
         c: STEPS record.
-        travel, turned: rad in this sample by the angle, and by the speed.
+        travel: rad in this sample; ``unexplained`` rad of it by the speeds of late.
     """
     if travel != 0.0:
         if c.number % _STEPS == 0:
@@ -61,7 +61,7 @@ def resolution(c: Record, travel: float, turned: float) -> float:
             c.least[0], c.most[0] = np.inf, 0.0
         c.number += 1
         c.least[0] = min(c.least[0], abs(travel))
-        c.most[0] = max(c.most[0], abs(travel - turned))
+        c.most[0] = max(c.most[0], unexplained)
     return min(c.least[0], c.least[1], max(c.most[0], c.most[1])) if c.number > _STEPS else 0.0
 
 
