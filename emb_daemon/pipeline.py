@@ -22,7 +22,7 @@ from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
 from emb_daemon.wire.frames import FRAME, put
 from emb_daemon.wire.layout import LAYOUT, pack
-from emb_daemon.wire.receive import ACCEPTED, RECEPTION, SECOND_SENDER, new_reception, receive
+from emb_daemon.wire.receive import ACCEPTED, RECEPTION, SECOND_SENDER, lateness, new_reception, receive
 
 #: Time for which a resolver sample waits for its current before the estimate is made without it. Senders put both on the bus
 #: together; half a cycle leaves as much time for the estimate.
@@ -53,6 +53,7 @@ CORNER = np.dtype(
         *fields("i8", "pending pending_ns"),
         *fields("f8", "pending_angle pending_speed"),
         *fields("i8", "sample_ns counter cycle announced predicted clock_ns late_ns agreed second_sender_ns"),
+        *fields("i8", "pending_late_ns sample_late_ns"),
         ("unproven", "?"),
     ],
     align=True,
@@ -211,6 +212,7 @@ def _collect(b, frames, start, predictions, count):
                 count = _complete(b, index, count)
             corner.pending = resolver.counter
             corner.pending_ns = resolver.time_ns
+            corner.pending_late_ns = lateness(resolver)
             corner.pending_angle = resolver.values[wire.MOTOR_ANGLE]
             corner.pending_speed = resolver.values[wire.MOTOR_SPEED]
         if corner.pending >= 0 and _paired(b, index, wire.CURRENT):
@@ -331,6 +333,8 @@ def _complete(b, index, count):
     row.brake_torque = np.nan
 
     corner.cycle += cycles
+    # A sender that does not keep its schedule (`_cycles`) is never late.
+    corner.sample_late_ns = corner.pending_late_ns if corner.agreed > 0 else 0
     if not corner.started:
         corner.clock_ns = now
     corner.started = True
@@ -351,12 +355,15 @@ def _head(b, row, index, age):
     row.time_ns = now
     row.counter = corner.counter if corner.started else 15
     row.age_cycles = age
+    row.late_ns = corner.sample_late_ns
     row.cycle = corner.cycle + age
     # A sample after predictions may be older than the last of them, whose cycle has already been announced.
     row.elapsed_cycles = max(row.cycle - corner.announced, 0)
     corner.announced = max(row.cycle, corner.announced)
 
     reasons = b.disturbed[index]
+    if row.late_ns > _JITTER_NS:
+        reasons |= contract.BUS_DISTURBED
     base = wire.CORNER_MESSAGES * index
     if age >= LATE_CYCLES:
         reasons |= contract.RESOLVER_LOST
@@ -403,7 +410,7 @@ def _set_values(e, kind, asked, values):
         values[1] = np.inf if e.mode == contract.INIT or e.mode == contract.FAULT else 1e-3 * e.sigma
         values[2] = e.counter
         values[3] = e.source
-        values[4] = e.age_cycles * (CYCLE_NS // 1_000_000)
+        values[4] = e.age_cycles * (CYCLE_NS // 1_000_000) + (e.late_ns // 1_000_000 if e.late_ns > CYCLE_NS else 0)
     elif kind == wire.PAD_TEMP:
         values[0], values[1] = e.surface[0], e.mean[0]
         values[2], values[3] = e.surface[1], e.mean[1]

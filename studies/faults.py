@@ -149,9 +149,14 @@ def during(bus: Callable, begin_s: float, end_s: float = np.inf) -> Callable:
     return lambda frames, time_s: bus(frames, time_s) if begin_s <= time_s < end_s else frames
 
 
+def ids_of(*slots: int) -> list[int]:
+    """CAN ids of the messages of some slots, of corner FL or of the car."""
+    return [_IDS[slot] for slot in slots]
+
+
 def lose(*slots: int) -> Callable:
     """A bus that loses the messages of some slots."""
-    ids = [_IDS[slot] for slot in slots]
+    ids = ids_of(*slots)
     return lambda frames, _: frames[~np.isin(frames["can_id"], ids)]
 
 

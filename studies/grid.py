@@ -28,14 +28,14 @@ from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.wire.contract import CYCLE_S, RESULT_ACCEPTED
-from studies import faults, unlisted
+from studies import faults, senders, unlisted
 from studies.drives import park_on_latch
 from studies.faults import LEARNED, NOMINAL, Fault, Size, size_of
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
 from studies.strangers import draw_stranger
 
 #: Faults that drives may have.
-FAMILIES = faults.FAMILIES | unlisted.FAMILIES
+FAMILIES = faults.FAMILIES | unlisted.FAMILIES | senders.FAMILIES
 #: The park brake is applied this long, s: settling, a stroke of the car's 20 s and the daemon's evaluation fit into it.
 _PARK_S = 34.0
 #: Cycles of a stretch: training ends if the car receives no request of the daemon for 25.

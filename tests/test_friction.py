@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.estimator import paths
 from emb_daemon.estimator.records import new_state
-from emb_daemon.models.torque import NOISE_TURNS_BACK, friction_state, turned_back
+from emb_daemon.models.lateness import LATELY, beyond_speeds, remember
+from emb_daemon.models.torque import NOISE_TURNS_BACK, STEPS, friction_state, resolution, turned_back, within_count
 from emb_daemon.offline import estimate
 from emb_daemon.offline.run import run_paths
 from emb_daemon.offline.score import rmse
@@ -223,14 +224,59 @@ def test_friction_follows_of_a_noisy_angle_what_is_more_than_its_presliding(para
     s, p = new_state()[0], parameters[0]
     s["turned_back"] = noisy
     way = 0.9 * p["presliding_angle"]
-    slid = paths._slid(s, p, way, way, 0.004)
+    slid = paths._slid(s, p, way, way, 0.0, 0.004)
     assert slid == pytest.approx(0.0 if noisy else way - paths.FLICKER_RAD)
     s["turned_back"] = noisy
-    after = paths._slid(s, p, 3.0 * way, 2.0 * way, 0.004)
+    after = paths._slid(s, p, 3.0 * way, 2.0 * way, 0.0, 0.004)
     assert after == pytest.approx(3.0 * way - p["presliding_angle"] if noisy else 2.0 * way)
     # One that stands has not forgotten which way it came.
-    paths._slid(s, p, 3.0 * way, 0.0, 0.004)
+    paths._slid(s, p, 3.0 * way, 0.0, 0.0, 0.004)
     assert s["direction"] == 2.0 * way
+
+
+def _counts(angle, speed, steps=None):
+    """`resolution` after these angles, rad, and the speeds beside them, rad/s."""
+    steps, lately = np.zeros((), STEPS)[()] if steps is None else steps, np.zeros((), LATELY)[()]
+    for travel, now in zip(np.diff(angle, prepend=angle[0]), speed, strict=True):
+        remember(lately, now, 0.004)
+        count = resolution(steps, travel, beyond_speeds(lately, travel, 0.004))
+    return count
+
+
+@pytest.mark.parametrize("late", [0, 1, 8])
+def test_counts_of_an_angle_show_in_its_small_steps_beside_the_speeds(late):
+    """Not in those of a smooth motion, be the angle late, nor of one that goes steadily; one value that is wrong is none."""
+    way, random = 3.0 * np.sin(0.03 * np.arange(3000)), np.random.default_rng(1)
+    speed = np.diff(way, prepend=0.0) / 0.004 + random.normal(0.0, 0.3, 3000)
+    come = np.concatenate([np.zeros(late), way[: len(way) - late]])
+    for count in (0.01, 0.03, 0.1):
+        found = _counts(2e-4 * np.round(count * np.floor(come / count) / 2e-4), speed)
+        assert 0.5 * count < found < 1.05 * count
+    assert max(_counts(come, speed), _counts(come + random.normal(0.0, 2e-4, 3000), speed)) < paths.FLICKER_RAD
+    spiked = come.copy()
+    spiked[[2700, 2800]] += 1.0
+    assert _counts(spiked, speed) < paths.COARSE_RAD
+    assert _counts(0.02 * np.arange(3000), np.full(3000, 5.1)) < paths.FLICKER_RAD
+    assert _counts(0.03 * np.floor(way[:60] / 0.03), speed[:60]) == 0.0
+
+
+def test_a_motor_may_have_gone_back_within_a_count():
+    assert within_count(1.0, 0.0, 0.03) == 1.0
+    assert within_count(1.0, 0.03, 0.03) == pytest.approx(-1.0 + 2.0 * np.exp(-1.0))
+    assert within_count(-0.5, 10.0, 0.03) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("count_rad", [0.006, 0.03, 0.06])
+def test_friction_of_a_hold_is_unknown_beside_an_angle_in_coarse_counts(count_rad):
+    """Else what it carries would be that of the last stroke, the torque mean another force, and stiffness be learned of it."""
+
+    def quantize(samples):
+        samples["angle"] = count_rad * np.floor(samples["angle"] / count_rad)
+
+    coarse, force = city.changed(quantize, seconds=40.0)
+    good, _ = city.changed(seconds=40.0)
+    assert rmse(coarse["force"] - force) < rmse(good["force"] - force) + 0.3 * count_rad * 1800.0
+    assert np.mean(np.abs(coarse["force"] - force) > 3.0 * np.hypot(coarse["sigma"], 25.0)) < 0.01
 
 
 @pytest.mark.parametrize(("hz", "way_rad", "current_A"), [(15.0, 0.005, 0.1), (14.0, 0.007, 0.1), (5.0, 0.004, 0.5)])

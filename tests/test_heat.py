@@ -248,6 +248,21 @@ def test_air_that_is_colder_than_the_disc_tells_of_heat_on_its_way_only_at_the_s
     assert (s["temperature_sigma"] > 100.0) == wider and (s["history_sigma"] > 100.0) == wider
 
 
+@pytest.mark.parametrize(("plates", "wheel_speed", "vehicle_speed", "sigma"), [
+    (24.0, 30.0, 0.0, 100.0), (24.0, 0.0, 9.0, 100.0), (24.0, 0.0, 0.0, 4.0), (60.0, 30.0, 9.0, 148.0), (22.5, 30.0, 9.0, 0.0),
+])  # fmt: skip
+def test_what_pads_of_a_car_under_way_hold_more_than_their_plates_show_is_unknown(
+    parameters, plates, wheel_speed, vehicle_speed, sigma
+):
+    """Where plates are warmer than the caliper by more than thermocouples differ: heat is on its way, of a stop perhaps."""
+    s, m = _warm(20.0, 20.0)
+    s["temperature_known"], s["rested_s"], s["temperature_sigma"] = False, 0.0, 0.0
+    m["has_thermocouple"], m["inner_backplate"], m["outer_backplate"], m["caliper"] = True, plates, plates, 20.0
+    m["has_wheel_speed"], m["wheel_speed"], m["has_status"], m["vehicle_speed"] = True, wheel_speed, True, vehicle_speed
+    heat(s, parameters[0], m)
+    assert s["temperature_sigma"] == pytest.approx(sigma) and s["history_sigma"] == pytest.approx(sigma)
+
+
 def test_pads_of_different_warmth_are_as_soft_after_a_restart_as_their_mean(parameters):
     thermal = parameters[0]["thermal"]
     thermal["softening"], thermal["softening_history"] = 4e-4, 0.0

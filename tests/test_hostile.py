@@ -89,6 +89,7 @@ def test_who_contradicts_any_other_input_makes_it_a_fault_too(car, can_id):  # n
     first, last = forged["time_ns"][[0, -1]]
     contested = (estimates["time_ns"] > first + 2 * CYCLE_NS) & (estimates["time_ns"] < last + 995 * MS)
     assert len(forged) >= 3 and np.all(estimates["mode"][contested] == r.FAULT)
+    assert np.all(estimates["source"][contested] == r.INVALID)
     assert np.all(estimates["reasons"][contested] & r.E2E_ERROR)
     assert np.all(estimates["mode"][estimates["time_ns"] > last + 1015 * MS] != r.FAULT)
 

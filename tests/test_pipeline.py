@@ -232,6 +232,39 @@ def test_delayed_frames_change_no_estimate(car, held_ms):
     assert np.array_equal(plain["cycle"], answered["cycle"]) and np.array_equal(plain["force"], answered["force"])
 
 
+def test_what_a_gateway_collects_and_sends_together_is_old(car):
+    """Every 16 ms four samples come at once. Of each but the newest, force, InputAge and a reason say that it is late."""
+    frames = wirekit.merged(*_sliding(800))
+    together, later = frames.copy(), (frames["time_ns"] > 1200 * MS) & np.isin(frames["can_id"], [0x100, 0x110])
+    together["time_ns"][later] = -(-together["time_ns"][later] // (16 * MS)) * 16 * MS
+    together = wirekit.merged(together)
+    plain, _ = _run(car, frames)
+    estimates, sent = _run(car, together)
+    estimates = estimates[estimates["is_sample"]]
+    # Wheel and plates are heard in time, so that a late sample has newer ones.
+    assert np.allclose(plain["force"], estimates["force"], atol=1.0) and not plain["late_ns"].any()
+    settled = slice(400, None)
+    late = estimates["late_ns"][settled]
+    assert set(np.unique(late // MS)) == {0, 4, 8, 12}
+    assert np.array_equal(estimates["reasons"][settled] & r.BUS_DISTURBED != 0, late > 8 * MS)
+    # Two hundred newtons in a cycle: a force that is three of them old is known accordingly.
+    moved = np.abs(plain["force"][settled][3:] - plain["force"][settled][:-3])
+    oldest = late[:-3] == 12 * MS
+    assert np.all(estimates["sigma"][settled][:-3][oldest] > 0.3 * moved[oldest])
+    assert np.all(estimates["sigma"][settled][late > 4 * MS] > 2.0 * plain["sigma"][settled][late > 4 * MS])
+    assert np.all(estimates["sigma"][settled][late == 0] < 1.2 * plain["sigma"][settled][late == 0])
+    ages = [int(frame["data"]) >> 56 for frame in sent[sent["can_id"] == 0x200]][-100:]
+    assert set(ages) == {0, 8, 12, 16}, "and predictions between them"
+
+
+def test_a_sample_within_half_a_cycle_is_punctual(car):
+    """Frames jitter on any bus."""
+    frames = wirekit.merged(*_sliding(600))
+    frames["time_ns"] += np.where(np.isin(frames["can_id"], [0x100, 0x110]), frames["time_ns"] // (4 * MS) % 2 * 2 * MS, 0)
+    plain, shaken = _run(car, wirekit.merged(*_sliding(600)))[0], _run(car, wirekit.merged(frames))[0]
+    assert shaken["late_ns"].max() == 2 * MS and np.array_equal(plain["sigma"], shaken["sigma"])
+
+
 def test_the_pause_of_a_sender_is_made_up_for(car):
     """20 ms without a frame and a counter that goes on as if nothing were: the time is made up for one sample later."""
     frames = np.concatenate(_sliding(60))

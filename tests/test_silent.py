@@ -14,7 +14,7 @@ from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import ADAPTING, DEGRADED, FAULT, FUSED, INVALID, RESULT_ACCEPTED, RUNNING, STIFFNESS_ONLY
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
-from studies import unlisted
+from studies import senders, unlisted
 from studies.faults import Size, alter, lose, size_of
 from studies.grid import FAMILIES, brake_of, draw_drive, drive, prepare
 from studies.phases import first_flag_s, judge
@@ -158,12 +158,12 @@ def test_every_family_draws_a_fault_within_the_drive(moments, name):
         assert 0.0 <= fault.onset_s <= moments["park"]
 
 
-@pytest.mark.parametrize("name", sorted(unlisted.FAMILIES))
+@pytest.mark.parametrize("name", sorted(unlisted.FAMILIES | senders.FAMILIES))
 def test_what_nobody_listed_is_wrong_in_what_frames_say_and_not_in_the_frames(moments, frames, name):
     """Otherwise E2E protection would refuse the frames before they reach the estimator."""
     frames = frames[default_layout()[0]["slot"][frames["can_id"]] >= 0]
     for seed in range(5):
-        fault, time_s = unlisted.FAMILIES[name](np.random.default_rng(seed), moments, Size()), moments["park"]
+        fault, time_s = FAMILIES[name](np.random.default_rng(seed), moments, Size()), moments["park"]
         for _ in range(20):
             time_s += 0.08
             for frame in fault.bus(frames.copy(), time_s):

@@ -36,6 +36,7 @@ def answer_row(row: Record, state: Record, p: Record, estimate: Record) -> None:
     estimate.cycle = row.cycle
     estimate.elapsed_cycles = row.elapsed_cycles
     estimate.age_cycles = row.age_cycles
+    estimate.late_ns = row.late_ns
     estimate.corner = row.corner
     estimate.counter = row.counter
     estimate.is_sample = not row.is_prediction
@@ -45,7 +46,7 @@ def answer_row(row: Record, state: Record, p: Record, estimate: Record) -> None:
         step(state, p, row, estimate)
     estimate.reasons |= row.reasons
     if estimate.reasons & CONTESTED:
-        estimate.mode = FAULT
+        estimate.mode, estimate.source = FAULT, INVALID
     elif not state.started:
         estimate.mode = INIT
     elif estimate.source == INVALID:

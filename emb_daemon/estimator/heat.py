@@ -20,6 +20,9 @@ TOUCHING_N = 200.0
 #: Rise of pads over that of their backing plates while heat is on its way: the pad's own resistance over that to the plate's
 #: surroundings.
 _BEHIND_PLATES = 4.0
+#: What pads of a car under way may have got that their plates do not show yet, K: as much as one stop from motorway speed or
+#: some from less heat a disc.
+_UNDER_WAY_K = 100.0
 #: By which thermocouples of a brake at rest differ: their tolerance (IEC 60584, class 1: 1.5 K each) and noise, K.
 _PLATES_SPREAD_K = 3.0
 #: Time by which a vehicle status that is sent at all has been heard, s: its cycle and half as much. Its ambient temperature
@@ -53,7 +56,7 @@ def _start_heat(s, t, m):
         share = t.node_position[node] / t.thickness
         s.pads[0, node] = s.disc + share * (m.inner_backplate - s.disc)
         s.pads[1, node] = s.disc + share * (m.outer_backplate - s.disc)
-    _widen_start(s, m.caliper)
+    _widen_start(s, m, m.caliper)
     _tell_temperatures(s, t)
     _begin_watch(s, m)
     s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
@@ -61,9 +64,14 @@ def _start_heat(s, t, m):
 
 
 @njit
-def _widen_start(s, around):
-    """Plates that are not as warm as what is ``around`` them (degC) tell of heat on its way, not of how long it has been."""
-    uncertainty = _BEHIND_PLATES * max(abs(s.disc - around) - _PLATES_SPREAD_K, 0.0)
+def _widen_start(s, m, around):
+    """Plates that are not as warm as what is ``around`` them (degC) tell of heat on its way, not of how long it has been; of a
+    car that is under way not even how much."""
+    apart = abs(s.disc - around) - _PLATES_SPREAD_K
+    uncertainty = _BEHIND_PLATES * max(apart, 0.0)
+    under_way = (m.has_wheel_speed and m.wheel_speed > TURNING_RAD_PER_S) or (m.has_status and m.vehicle_speed > 0.0)
+    if apart > 0.0 and under_way:
+        uncertainty = max(uncertainty, _UNDER_WAY_K)
     s.temperature_sigma, s.history_sigma = max(s.temperature_sigma, uncertainty), max(s.history_sigma, uncertainty)
 
 
@@ -168,7 +176,7 @@ def heat(s: Record, p: Record, m: Record) -> None:
     if m.has_status and not s.ambient_heard:
         s.ambient_heard = True
         if m.cycle * CYCLE_S < _HEARD_S and not s.resumed:
-            _widen_start(s, m.ambient)
+            _widen_start(s, m, m.ambient)
     touching = s.fused > TOUCHING_N
     if touching != s.touching and s.heat_time > 0.0:
         _flow(s, t, p.effects, m)

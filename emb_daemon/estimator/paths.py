@@ -9,15 +9,17 @@ from emb_daemon.estimator.uneven import way_per_rad
 from emb_daemon.jit import Record, njit, sq
 from emb_daemon.models.fusion import CONTACT
 from emb_daemon.models.gear import through_gear
-from emb_daemon.models.lateness import friction_since, remember, turned_within
+from emb_daemon.models.lateness import beyond_speeds, friction_since, remember, turned_within
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag, mean_slope, travel_at
 from emb_daemon.models.torque import (
     NOISE_TURNS_BACK,
     friction_state,
+    resolution,
     slid_angle,
     turned_back,
     turned_unseen,
     unexplained_torque,
+    within_count,
 )
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.wire.contract import CYCLE_S
@@ -37,6 +39,8 @@ _SLID = 0.5
 _SHORT = 1.0
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
+#: Count of an angle, rad, above which it hides which way friction holds: two of that resolver's.
+COARSE_RAD = 4.0 * FLICKER_RAD
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
 _CREEP_S = (1.0, 8.0)
 #: A time after which everything has settled, s.
@@ -220,8 +224,8 @@ def begin_paths(s: Record, p: Record, m: Record, factor: float) -> None:
 
 
 @njit
-def _slid(s, p, angle, travel, dt):
-    """Angle (rad) that the gear has slid through, with the motor at ``angle`` after ``travel`` rad.
+def _slid(s, p, angle, travel, count, dt):
+    """Angle (rad) that the gear has slid through, with the motor at ``angle`` after ``travel`` rad, in counts of ``count``.
 
     A noisy angle goes back and forth, and friction that followed it would turn over and over while the motor stands: what the
     torque then says of friction would pass for a change of the brake. Of noise that is known by its turning back, friction
@@ -235,7 +239,7 @@ def _slid(s, p, angle, travel, dt):
         return 0.0
     noise = p.presliding_angle if s.turned_back > NOISE_TURNS_BACK else 0.0
     before = s.slid_angle
-    s.slid_angle = slid_angle(before, angle, max(noise, FLICKER_RAD))
+    s.slid_angle = slid_angle(before, angle, max(noise, FLICKER_RAD, 0.5 * count))
     return s.slid_angle - before
 
 
@@ -273,7 +277,11 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     known = effects.known_delay(p.effects)
     age = known + s.late if s.late > 0.5 * CYCLE_S else known
     early = turned_within(s.lately, min(age, 0.0))
-    slid = _slid(s, p, m.angle + early, m.angle - s.angle, m.dt)
+    travel = m.angle - s.angle
+    count = resolution(s.steps, travel, beyond_speeds(s.lately, travel, m.dt))
+    if count <= COARSE_RAD:
+        count = 0.0
+    slid = _slid(s, p, m.angle + early, travel, count, m.dt)
     before, variance = s.friction_state, s.friction_variance
     s.friction_state, mean, s.friction_variance = friction_state(
         before, variance, slid, p.presliding_angle, DISSOLVING_PER_S, m.dt
@@ -291,6 +299,10 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
         # Nor is it known whether an angle that moves while the speed, now and of late, shows nothing has slid it: nothing
         # drives the motor of an open brake, while that of a closed one follows pads and disc.
         s.friction_variance = min(sq(sqrt(variance) + _SLID * abs(s.friction_state - before)), 1.0)
+    if slid == 0.0 and count > 0.0:
+        other = within_count(s.friction_state, count, p.presliding_angle)
+        mean = 0.5 * (s.friction_state + other)
+        s.friction_variance = max(s.friction_variance, sq(mean - other))
     if age > 0.0:
         mean = friction_since(s.lately, s.friction_state, mean, age, _CERTAINLY * p.speed_sigma, p.presliding_angle)
     s.friction_mean = mean

@@ -20,6 +20,7 @@ from emb_daemon.models.gear import GEAR
 from emb_daemon.models.lateness import LATELY, LATENESS
 from emb_daemon.models.plausibility import PLAUSIBILITY
 from emb_daemon.models.thermal import CHAIN, NODES
+from emb_daemon.models.torque import STEPS
 from emb_daemon.models.wander import WANDER
 
 CURVE_TERMS = 5
@@ -70,11 +71,12 @@ PARAMETERS = np.dtype(
 )
 
 #: One row for the estimator. It is a resolver sample, or asks for a prediction ``age_cycles`` after the last
-#: one. ``dt`` s since the last sample; ``cycle`` its number since the first, ``elapsed_cycles`` since the last row;
+#: one. ``dt`` s since the last sample; ``late_ns`` by how much it came later than the promptest; ``cycle`` its number since
+#: the first, ``elapsed_cycles`` since the last row;
 #: ``reasons`` what is amiss outside the estimator. ``brake_torque`` N m is a rig's, NaN in a car.
 SAMPLE = np.dtype(
     [
-        *fields("i8", "time_ns cycle elapsed_cycles age_cycles corner counter reasons"),
+        *fields("i8", "time_ns late_ns cycle elapsed_cycles age_cycles corner counter reasons"),
         ("is_prediction", "?"),
         *fields(
             "f8",
@@ -126,6 +128,7 @@ STATE = np.dtype(
         # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late. What
         # effects have ``gained`` of thickness, m, and by how much that ``swelled`` or shrank in this sample.
         *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back gained swelled"),
+        ("steps", STEPS),
         # Way (rad) that the gear has slid since it last turned back, with its sign, and the way before that.
         *fields("f8", "swing swing_before"),
         *fields("f8", "torque_age balance leverage"),
@@ -218,7 +221,7 @@ STATE = np.dtype(
 
 ESTIMATE = np.dtype(
     [
-        *fields("i8", "time_ns cycle elapsed_cycles age_cycles corner counter mode source reasons facts"),
+        *fields("i8", "time_ns late_ns cycle elapsed_cycles age_cycles corner counter mode source reasons facts"),
         ("is_sample", "?"),
         ("engaged", "?"),
         *fields("i8", "adapt_request adapt_progress adapt_result"),

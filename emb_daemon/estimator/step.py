@@ -67,12 +67,14 @@ from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, believe_resol
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
 from emb_daemon.models.wander import STANDING_RAD_PER_S, forget_wander, leave_stretch, watch_wander
-from emb_daemon.wire.contract import CYCLE_S, INIT, INVALID, PREDICTED, RUNNING
+from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S, INIT, INVALID, PREDICTED, RUNNING
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
 SILENCE_S = 0.1
 #: Share of what the pads gain between the moment of the estimate and the sample that may be wrong: the motor accelerates.
 _LED = 0.2
+#: Lateness of a sample, ns, beyond which its force is an old one: half a cycle, by which frames jitter on any bus.
+_PUNCTUAL_NS = CYCLE_NS // 2
 #: Samples in which a motor that stands must have done so, and time over which its speed's noise is averaged, s.
 _HELD, _NOISE_S = 25, 0.5
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
@@ -210,6 +212,8 @@ def _advance(s, p, m, angle, speed, out):
     if p.sensor.limit > 0.0 and by_torque:
         out.force, out.sigma = with_sensor(s.sensor, out.force, out.sigma)
     bound(s.monitor, p, m, s.gear_friction)
+    if m.late_ns > _PUNCTUAL_NS:
+        out.sigma = hypot(out.sigma, _gained_since(s, p, 1e-9 * m.late_ns))
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage
     _tell_contact(s, p, out.contact_sigma, out)
@@ -326,6 +330,22 @@ def _look(s, p, m, facts, out):
 
 
 @njit
+def _gained(s, p, age):
+    """Largest change of force (N) in ``age`` s: the motor cannot have gone faster than its limit, and no further than full
+    clamp. Clamping changes more than releasing."""
+    _, steep = steepest(p.gear)
+    reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * steep * age, p.curve)
+    start, _ = characteristic_curve(s.past_contact, p.curve)
+    return min(s.factor * s.scale * (reached - start), p.maximum_force)
+
+
+@njit
+def _gained_since(s, p, age):
+    """Change of force (N) since a sample that came ``age`` s later than others: as the motor turned, within a cycle."""
+    return s.slope * s.gear_slope * abs(s.speed) * age if age <= CYCLE_S else _gained(s, p, age)
+
+
+@njit
 def predict(s: Record, p: Record, age: float, out: Record) -> None:
     """Prediction ``age`` seconds after the last sample: the last force, and how far it may have changed since.
 
@@ -334,13 +354,7 @@ def predict(s: Record, p: Record, age: float, out: Record) -> None:
     out.mode = RUNNING if s.started else INIT
     out.source = PREDICTED if s.started and age <= SILENCE_S else INVALID
     out.reasons = out.facts = 0
-    # The motor cannot have gone faster than its limit, and no further than full clamp. Clamping changes more than releasing.
-    _, steep = steepest(p.gear)
-    reached, _ = characteristic_curve(s.past_contact + p.maximum_speed * steep * age, p.curve)
-    start, _ = characteristic_curve(s.past_contact, p.curve)
-    moved = min(s.factor * s.scale * (reached - start), p.maximum_force)
-    out.force = s.fused
-    out.sigma = sqrt(s.fused_sigma * s.fused_sigma + moved * moved)
+    out.force, out.sigma = s.fused, hypot(s.fused_sigma, _gained(s, p, age))
     out.stiffness_force = out.torque_force = out.ml_force = np.nan
     _tell_contact(s, p, sqrt(s.covariance[CONTACT, CONTACT]), out)
     out.stiffness_factor = s.factor * s.scale if s.started else 1.0

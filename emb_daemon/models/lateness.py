@@ -138,6 +138,14 @@ def speed_then(w: Record, age: float) -> float:
 
 
 @njit
+def beyond_speeds(w: Record, travel: float, dt: float) -> float:
+    """By how much ``travel`` rad in ``dt`` s is more or less than at any of LATELY's speeds, rad: what no age of the angle
+    explains."""
+    least, most = w.speed.min() * dt, w.speed.max() * dt
+    return max(least - travel, travel - most, 0.0)
+
+
+@njit
 def way_beside(w: Record, travel: float, speed: float, before: float, age: float, dt: float) -> float:
     """Way (rad) in ``dt`` s by the speeds, to be compared with the ``travel`` rad of the angle: by ``speed`` rad/s and the one
     ``before``, or, if the angle is known to be ``age`` s late, by the speeds ``age`` s ago, of which LATELY ``w`` holds all

@@ -7,7 +7,9 @@ while the motor stands still.
 
 from math import exp, sqrt
 
-from emb_daemon.jit import njit, sq
+import numpy as np
+
+from emb_daemon.jit import Record, fields, njit, sq
 
 #: Time constant over which reversals are counted, s: a dozen samples. One reversal adds 0.08 to the share.
 _OF_LATE_S = 0.05
@@ -16,6 +18,12 @@ _OF_LATE_S = 0.05
 NOISE_TURNS_BACK = 0.15
 #: Standard deviation of a friction that is anywhere between all and none.
 _BETWEEN = 1.0 / sqrt(3.0)
+#: Number of an angle's steps in which its count is looked for. A stroke begins and ends slowly, and has more of them.
+_STEPS = 64
+
+#: Steps of an angle, in the ``number`` now and in the `_STEPS` before: the ``least`` of them, and the ``most`` by which one
+#: was beyond what the speeds explain, rad.
+STEPS = np.dtype([("least", "f8", (2,)), ("most", "f8", (2,)), *fields("i8", "number")], align=True)
 
 
 @njit
@@ -33,6 +41,36 @@ def slid_angle(before: float, angle: float, flicker: float) -> float:
     the direction from which the motor came would be lost.
     """
     return min(max(before, angle - flicker), angle + flicker)
+
+
+@njit
+def resolution(c: Record, travel: float, unexplained: float) -> float:
+    """Count of the angle, rad, by its steps so far: no more than the least of them, and no more than what was ever beyond the
+    speeds of the motor. 0 until enough are known.
+
+    An angle in fine counts has small steps whenever the motor starts or stops; one that has none because the motor goes fast
+    or jerks agrees with the speeds.
+
+    Args:
+        c: STEPS record.
+        travel: rad in this sample; ``unexplained`` rad of it by the speeds of late.
+    """
+    if travel != 0.0:
+        if c.number % _STEPS == 0:
+            c.least[1], c.most[1] = c.least[0], c.most[0]
+            c.least[0], c.most[0] = np.inf, 0.0
+        c.number += 1
+        c.least[0] = min(c.least[0], abs(travel))
+        c.most[0] = max(c.most[0], unexplained)
+    return min(c.least[0], c.least[1], max(c.most[0], c.most[1])) if c.number > _STEPS else 0.0
+
+
+@njit
+def within_count(state: float, count: float, presliding_angle: float) -> float:
+    """Friction state of a motor that has gone back as far as a ``count`` rad of its angle does not show; ``state`` by what
+    the angle shows."""
+    back = -1.0 if state > 0.0 else 1.0
+    return back + (state - back) * exp(-count / presliding_angle)
 
 
 @njit

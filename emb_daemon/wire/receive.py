@@ -114,6 +114,14 @@ def _follow_schedule(due, time_ns, reception):
 
 
 @njit
+def lateness(reception: Record) -> Integer:
+    """By how much the last frame in sequence came later than the promptest, ns: of the last window, or, before one is full, of
+    those that were seen."""
+    late = reception.sequence_ns - reception.due_ns
+    return late - reception.later_ns if reception.window == _FIRST_WINDOW else late
+
+
+@njit
 def _contests(frame, reception, cycle_ns):
     """Whether a frame has the counter of the last one in sequence but other content. One sender never does that, so there are
     two, and the receiver cannot know which is genuine."""
