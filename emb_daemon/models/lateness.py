@@ -141,8 +141,10 @@ def speed_then(w: Record, age: float) -> float:
 def beyond_speeds(w: Record, travel: float, dt: float) -> float:
     """By how much ``travel`` rad in ``dt`` s is more or less than at any of LATELY's speeds, rad: what no age of the angle
     explains."""
-    least, most = w.speed.min() * dt, w.speed.max() * dt
-    return max(least - travel, travel - most, 0.0)
+    least = most = w.speed[0]
+    for i in range(1, _KEPT):
+        least, most = min(least, w.speed[i]), max(most, w.speed[i])
+    return max(least * dt - travel, travel - most * dt, 0.0)
 
 
 @njit
