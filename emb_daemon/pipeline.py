@@ -212,7 +212,7 @@ def _collect(b, frames, start, predictions, count):
                 count = _complete(b, index, count)
             corner.pending = resolver.counter
             corner.pending_ns = resolver.time_ns
-            corner.pending_late_ns = lateness(resolver)
+            corner.pending_late_ns = lateness(resolver, CYCLE_NS)
             corner.pending_angle = resolver.values[wire.MOTOR_ANGLE]
             corner.pending_speed = resolver.values[wire.MOTOR_SPEED]
         if corner.pending >= 0 and _paired(b, index, wire.CURRENT):

@@ -148,10 +148,10 @@ def test_who_flickered_at_rest_fifty_times_is_stuck_when_twelve_samples_repeat(f
     assert watched.pass_by(1, speed=speed, follows=0.0) == verdict
 
 
-@pytest.mark.parametrize(("speed", "samples"), [(100.0, 39), (10.0, 90)])
-def test_an_angle_that_does_not_follow_the_speed_is_stuck_until_it_has_for_25_samples(speed, samples):
-    """100 rad/s over 0.6 rad and the way of a delay of 10 ms, 1 rad: five samples of 0.4 rad, of which some leak away. What is
-    left, 1.8 rad, first leaks away to what a delay explains at the present speed, 1.05 or 0.15 rad."""
+@pytest.mark.parametrize(("speed", "samples"), [(100.0, 25), (10.0, 26)])
+def test_an_angle_that_does_not_follow_the_speed_is_stuck_until_it_does_for_25_samples(speed, samples):
+    """100 rad/s over 0.6 rad and the way of a delay of 10 ms, 1 rad: five samples of 0.4 rad, of which some leak away. The
+    first sample of another speed is not as that says."""
     watched = Watched()
     watched.m["speed"] = 100.0
     assert watched.pass_by(3, speed=100.0, follows=0.0) == AGREE
@@ -161,16 +161,6 @@ def test_an_angle_that_does_not_follow_the_speed_is_stuck_until_it_has_for_25_sa
     assert watched.c["frozen_s"][0] == pytest.approx(before + (samples - 1) * _DT), "the motor turned on meanwhile"
     assert watched.pass_by(1, speed=speed) == AGREE
     assert watched.c["contradiction"][0] == 0.0 and watched.c["frozen_s"][0] == 0.0
-
-
-@pytest.mark.parametrize("follows", [0.7, -1.0])
-def test_an_angle_that_follows_a_slow_speed_only_within_each_sample_stays_stuck(follows):
-    """12 mrad off in a sample at 10 rad/s, or 80 with the wrong sign, may be a delay; over a tenth of a second it is none."""
-    watched = Watched()
-    watched.m["speed"] = 100.0
-    assert watched.pass_by(5, speed=100.0, follows=0.0) == STIFFNESS_WRONG
-    assert watched.pass_by(200, speed=10.0, follows=follows) == STIFFNESS_WRONG
-    assert watched.pass_by(200, speed=10.0) == AGREE
 
 
 def test_a_small_mismatch_of_angle_and_speed_is_forgotten():

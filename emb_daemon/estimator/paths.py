@@ -39,8 +39,9 @@ _SLID = 0.5
 _SHORT = 1.0
 #: Half a count of a 4096-count resolver.
 FLICKER_RAD = 0.0008
-#: Count of an angle, rad, above which it hides which way friction holds: two of that resolver's.
-COARSE_RAD = 4.0 * FLICKER_RAD
+#: Count of an angle, rad, above which it hides which way friction holds: of 10 bit a turn. Resolvers of 14 bit and more seem
+#: to have up to 2.9 mrad by their least steps, on the logs of rigs that are simulated by others.
+COARSE_RAD = 2.0 * pi / 1024.0
 #: Time constants of what pads creep beyond the calibration, s: between a stroke and a stop, and a few stops.
 _CREEP_S = (1.0, 8.0)
 #: A time after which everything has settled, s.

@@ -62,7 +62,7 @@ _REPEATED, _NEVER_REPEATED = 8, 50
 _FLICKERED, _FROZEN = 50, 12
 #: Time constant over which angle and integrated speed are compared (s), and difference (rad) that is a fault, in addition to
 #: what a signal delay of `_DELAY_S` causes. A resolver is used again after `_RETURNED` samples in which the angle moved and
-#: followed the speed within `_ALIKE_RAD`, in each sample and over that time.
+#: followed the speed within `_ALIKE_RAD`.
 _COMPARED_S, _APART_RAD, _DELAY_S = 0.1, 0.6, 0.01
 _RETURNED, _ALIKE_RAD = 25, 0.05
 #: Share by which friction at rest may exceed what sliding takes.
@@ -144,7 +144,7 @@ def _count_repetitions(c, m, travel, step, delay, speed_before):
     """Update what is known of each sensor alone: how long it repeats its value, and whether angle and speed agree. ``travel``
     rad of the angle, ``step`` rad beyond the integrated speed, ``delay`` rad that a late angle explains."""
     c.apart = c.apart * exp(-m.dt / _COMPARED_S) + step
-    if max(abs(step), abs(c.apart)) > _ALIKE_RAD + delay:
+    if abs(step) > _ALIKE_RAD + delay:
         c.alike = 0
     elif abs(travel) > _STANDS_RAD:
         c.alike += 1

@@ -20,6 +20,8 @@ NOISE_TURNS_BACK = 0.15
 _BETWEEN = 1.0 / sqrt(3.0)
 #: Number of an angle's steps in which its count is looked for. A stroke begins and ends slowly, and has more of them.
 _STEPS = 64
+#: Share of a step that speeds must not explain: of a fast one the motor's speed between two samples may be beyond both.
+_MOSTLY = 0.5
 
 #: Steps of an angle, in the ``number`` now and in the `_STEPS` before: the ``least`` of them, and the ``most`` by which one
 #: was beyond what the speeds explain, rad.
@@ -61,7 +63,8 @@ def resolution(c: Record, travel: float, unexplained: float) -> float:
             c.least[0], c.most[0] = np.inf, 0.0
         c.number += 1
         c.least[0] = min(c.least[0], abs(travel))
-        c.most[0] = max(c.most[0], unexplained)
+        if unexplained > _MOSTLY * abs(travel):
+            c.most[0] = max(c.most[0], unexplained)
     return min(c.least[0], c.least[1], max(c.most[0], c.most[1])) if c.number > _STEPS else 0.0
 
 

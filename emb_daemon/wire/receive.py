@@ -114,11 +114,16 @@ def _follow_schedule(due, time_ns, reception):
 
 
 @njit
-def lateness(reception: Record) -> Integer:
+def lateness(reception: Record, cycle_ns: int) -> Integer:
     """By how much the last frame in sequence came later than the promptest, ns: of the last window, or, before one is full, of
-    those that were seen."""
+    those that were seen. Of a silence the schedule knows no whole turns of the counter, after which an early frame seems late
+    by nearly one."""
     late = reception.sequence_ns - reception.due_ns
-    return late - reception.later_ns if reception.window == _FIRST_WINDOW else late
+    if reception.window == _FIRST_WINDOW:
+        late -= reception.later_ns
+    turn = COUNTER_MODULO * cycle_ns
+    late %= turn
+    return late if late < turn - cycle_ns else 0
 
 
 @njit
