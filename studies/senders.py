@@ -250,7 +250,7 @@ def twice(rng, moments, size):
     by, at = draw_size(rng, 0.0002, 0.03), pick_sometime(rng, moments)
 
     def change(frames):
-        again = frames.copy()
+        again = frames[np.isin(frames["can_id"], ids_of(*range(wire.SLOTS)))]
         again["time_ns"] += int(1e9 * by)
         return np.concatenate((frames, again))
 
