@@ -212,7 +212,8 @@ def _collect(b, frames, start, predictions, count):
                 count = _complete(b, index, count)
             corner.pending = resolver.counter
             corner.pending_ns = resolver.time_ns
-            corner.pending_late_ns = lateness(resolver, CYCLE_NS)
+            # In whole cycles: the same of stamps that a log has rounded.
+            corner.pending_late_ns = CYCLE_NS * ((lateness(resolver, CYCLE_NS) + CYCLE_NS // 2) // CYCLE_NS)
             corner.pending_angle = resolver.values[wire.MOTOR_ANGLE]
             corner.pending_speed = resolver.values[wire.MOTOR_SPEED]
         if corner.pending >= 0 and _paired(b, index, wire.CURRENT):
@@ -410,7 +411,7 @@ def _set_values(e, kind, asked, values):
         values[1] = np.inf if e.mode == contract.INIT or e.mode == contract.FAULT else 1e-3 * e.sigma
         values[2] = e.counter
         values[3] = e.source
-        values[4] = e.age_cycles * (CYCLE_NS // 1_000_000) + (e.late_ns // 1_000_000 if e.late_ns > CYCLE_NS else 0)
+        values[4] = e.age_cycles * (CYCLE_NS // 1_000_000) + e.late_ns // 1_000_000
     elif kind == wire.PAD_TEMP:
         values[0], values[1] = e.surface[0], e.mean[0]
         values[2], values[3] = e.surface[1], e.mean[1]

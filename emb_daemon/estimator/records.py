@@ -71,9 +71,9 @@ PARAMETERS = np.dtype(
 )
 
 #: One row for the estimator. It is a resolver sample, or asks for a prediction ``age_cycles`` after the last
-#: one. ``dt`` s since the last sample; ``late_ns`` by how much it came later than the promptest; ``cycle`` its number since
-#: the first, ``elapsed_cycles`` since the last row;
-#: ``reasons`` what is amiss outside the estimator. ``brake_torque`` N m is a rig's, NaN in a car.
+#: one. ``dt`` s since the last sample; ``late_ns`` whole cycles by which it came later than the promptest; ``cycle`` its
+#: number since the first, ``elapsed_cycles`` since the last row; ``reasons`` what is amiss outside the estimator.
+#: ``brake_torque`` N m is a rig's, NaN in a car.
 SAMPLE = np.dtype(
     [
         *fields("i8", "time_ns late_ns cycle elapsed_cycles age_cycles corner counter reasons"),

@@ -67,14 +67,12 @@ from emb_daemon.models.plausibility import AGREE, STIFFNESS_WRONG, believe_resol
 from emb_daemon.models.stiffness import characteristic_curve, first_order_lag
 from emb_daemon.models.torque import torque_balance
 from emb_daemon.models.wander import STANDING_RAD_PER_S, forget_wander, leave_stretch, watch_wander
-from emb_daemon.wire.contract import CYCLE_NS, CYCLE_S, INIT, INVALID, PREDICTED, RUNNING
+from emb_daemon.wire.contract import CYCLE_S, INIT, INVALID, PREDICTED, RUNNING
 
 #: Time without a resolver sample, s, after which there is no estimate: the brake may have opened and closed.
 SILENCE_S = 0.1
 #: Share of what the pads gain between the moment of the estimate and the sample that may be wrong: the motor accelerates.
 _LED = 0.2
-#: Lateness of a sample, ns, beyond which its force is an old one: half a cycle, by which frames jitter on any bus.
-_PUNCTUAL_NS = CYCLE_NS // 2
 #: Samples in which a motor that stands must have done so, and time over which its speed's noise is averaged, s.
 _HELD, _NOISE_S = 25, 0.5
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
@@ -212,7 +210,7 @@ def _advance(s, p, m, angle, speed, out):
     if p.sensor.limit > 0.0 and by_torque:
         out.force, out.sigma = with_sensor(s.sensor, out.force, out.sigma)
     bound(s.monitor, p, m, s.gear_friction)
-    if m.late_ns > _PUNCTUAL_NS:
+    if m.late_ns > 0:
         out.sigma = hypot(out.sigma, _gained_since(s, p, 1e-9 * m.late_ns))
     s.angle_before, s.dt_before = s.angle, m.dt
     s.angle, s.speed, s.balance, s.leverage = m.angle, m.speed, torque, leverage

@@ -78,7 +78,7 @@ OUTPUTS = (
 #: Meaning of the fields that identify a SAMPLE.
 BOOKKEEPING = {
     "time_ns": "of the sample, ns, on the caller's clock; copied into the estimate",
-    "late_ns": "ns by which the sample came later than the promptest of its sender's; 0 if that is not known; copied",
+    "late_ns": "ns, in whole cycles, by which it came later than the promptest of its sender's; 0 if not known; copied",
     "cycle": "cycles of 4 ms since the first sample; copied",
     "elapsed_cycles": "cycles since the last call; copied",
     "age_cycles": "cycles since the last sample; 0 but for a prediction",
