@@ -130,20 +130,25 @@ def test_what_a_fit_has_left_at_nothing_is_no_effect(viscous):
     assert selection.model.of_effect("viscous_friction") and not revise(stuck).accepted
 
 
-def test_what_ends_at_the_bound_of_physics_is_another_cause(viscous):
-    """Of 3e-4 no more than two thirds may be viscous, or all of it."""
+def test_what_ends_at_the_bound_of_physics_may_be_another_cause(viscous):
+    """Of 3e-4 no more than two thirds may be viscous, or all of it: a term says all, which is not asked where all may be."""
     selection, _, _ = viscous
+    channel = selection.candidates["viscous_friction"].channel
     bare = selection.without("viscous_friction", "to ask it again")
     [viscous_friction] = [effect for effect in REGISTRY if effect.name == "viscous_friction"]
-    [amplitude] = bare.screening.coordinates["viscous_friction"].values()
-    reasons = {}
+    coordinates = dict(bare.screening.coordinates)
+    [amplitude] = coordinates["viscous_friction"].values()
+    found, left = {}, {}
     for high in (2e-4, amplitude.high):
         bare.screening.coordinates["viscous_friction"] = {amplitude.parameter: dataclasses.replace(amplitude, high=high)}
         [candidate] = bare.screening.test(bare.model, [viscous_friction])
         asked = bare.entered([candidate])
-        reasons[high] = asked.candidates["viscous_friction"].reason
-        assert (asked.accepted == ["viscous_friction"]) == (high > 2e-4)
-    assert reasons[2e-4] == "viscous_Nms_per_rad = 0.0002 N·m·s/rad is all that physics allows, and too little"
+        assert asked.accepted == ["viscous_friction"]
+        found[high], left[high] = grammar._without_shadows(asked, asked, channel), asked.model.noise(channel)
+    bare.screening.coordinates.update(coordinates)
+    [term] = found[2e-4].accepted
+    assert "motor_speed" in term and found[2e-4].model.noise(channel) < left[2e-4]
+    assert found[amplitude.high].accepted == ["viscous_friction"]
 
 
 def test_what_friction_does_as_it_turns_over_proves_no_effect(viscous, monkeypatch):

@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import warmth
 from emb_daemon.diagnose.forms import TEMPERATURES, Form, further_numbers, made_effect, places
 from emb_daemon.diagnose.held_heat import follow_signals
-from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, noise_left
+from emb_daemon.diagnose.model import LASTING, TOLERANCE, Model, is_shape, noise_left
 from emb_daemon.diagnose.prospects import (
     AS_GOOD,
     COARSE,
@@ -228,11 +228,13 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     """The same, or terms alone if these describe it more shortly, and leave less by what matters or are fewer causes without
     any further term.
 
-    An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds. It is then
-    asked again beside the terms."""
+    An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds, and so may
+    one that has all that physics allows it, beside which no term may be found. It is then asked again beside the terms."""
     suspects = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
     known = any(catalogue.candidates[name].in_calibration for name in suspects)
-    if not suspects or known or found.accepted == catalogue.accepted:
+    if found.accepted == catalogue.accepted:
+        suspects = [name for name in suspects if _is_at_limit(catalogue.model, name)]
+    if not suspects or known:
         return found
     bare = catalogue
     for name in suspects:
@@ -246,6 +248,12 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     fewer = len(_causes(both, channel)) < len(_causes(found, channel))
     fewer = fewer and len(_made(both, channel)) <= len(_made(found, channel))
     return both if (matters or fewer) and _is_shorter(both, found, channel) else found
+
+
+def _is_at_limit(model: Model, name: str) -> bool:
+    """Whether a fit has left an amplitude of an effect at a bound that is not nothing."""
+    own = [c for c in model.of_effect(name) if not is_shape(c)]
+    return any(abs(model.values[c]) >= c.step and c.is_held(model.values[c]) for c in own)
 
 
 def _with_hidden(found: Selection, catalogue: Selection, channel: str) -> Selection:

@@ -113,11 +113,6 @@ class Model:
         gain there."""
         return all(abs(self.values[c]) < c.step for c in amplitudes)
 
-    def is_at_limit(self, amplitude: Coordinate) -> bool:
-        """Whether a fit has left an amplitude at a bound that is not nothing."""
-        value = self.values[amplitude]
-        return abs(value) >= amplitude.step and amplitude.is_held(value)
-
     def without(self, gone: Iterable[Coordinate]) -> "Model":
         """With some coordinates taken out again, not refitted."""
         gone = set(gone)

@@ -128,8 +128,7 @@ class Selection:
         return replace(self.noted([refused]), model=model, dropped=self.dropped | {suspect})
 
     def entered(self, winners: list[Candidate]) -> "Selection":
-        """Effects accepted, one for each channel, and refitted. Out goes one that leaves its channel worse than before, or
-        ends at a bound of what physics allows."""
+        """Effects accepted, one for each channel, and refitted; one that leaves its channel worse than before goes out."""
         before = self.model
         values, chosen, centre = {}, [], {}
         for winner in winners:
@@ -149,12 +148,7 @@ class Selection:
         result = replace(self.noted(replace(winner, accepted=True) for winner in winners), model=model)
         for winner in winners:
             own = [c for c in result.model.of_effect(winner.effect.name) if not is_shape(c)]
-            limit = next((c for c in own if result.model.is_at_limit(c)), None)
-            if limit is not None:
-                # What these logs ask for lies beyond the bound: another cause, which this effect would keep from being found.
-                stands = f"{limit.parameter} = {result.model.values[limit]:.3g} {limit.unit}"
-                result = result.without(winner.effect.name, f"{stands} is all that physics allows, and too little")
-            elif result.model.noise(winner.channel) >= before.noise(winner.channel) or result.model.says_nothing(own):
+            if result.model.noise(winner.channel) >= before.noise(winner.channel) or result.model.says_nothing(own):
                 reason = "no fit of it with the calibration's own parameters is better than without it"
                 result = result.without(winner.effect.name, reason)
         return result
