@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from emb_daemon.wire import layout as wire
+from emb_daemon.wire.contract import CYCLE_S
 from studies.faults import (
     Fault,
     alter,
@@ -22,8 +23,6 @@ from studies.faults import (
 FAMILIES: dict[str, Callable] = {}
 
 _RESOLVER = (wire.MOTOR_ANGLE, wire.MOTOR_SPEED)
-#: Messages of a stretch of `studies.injected`: states of a fault are kept over stretches.
-_CYCLE_S = 0.004
 #: Message, signal and a usual step of what loses bits: rad, rad/s, and a share of the currents of `studies.faults.Size`.
 _SENSED = {
     "angle": (wire.RESOLVER, wire.MOTOR_ANGLE, 0.003),
@@ -187,7 +186,7 @@ def all_stale(rng, moments, size):
 
 
 @_family
-def every_other_lost(rng, moments, size):
+def messages_lost(rng, moments, size):
     """A share of one message is lost, at random."""
     slot, share = int(rng.choice([wire.RESOLVER, wire.CURRENT])), float(rng.uniform(0.1, 0.7))
     at = pick_sometime(rng, moments)
@@ -228,7 +227,7 @@ def late_in_groups(rng, moments, size):
         frames["time_ns"][rows] = (frames["time_ns"][rows] // step + 1) * step
         return frames
 
-    return Fault(f"{('resolver', 'current', 'all')[which]}, every {1e3 * every:.0f} ms", at, bus=during(_delay(change), at))
+    return Fault(f"{('resolver', 'current', 'both')[which]}, every {1e3 * every:.0f} ms", at, bus=during(_delay(change), at))
 
 
 @_family
@@ -264,7 +263,7 @@ def current_hum(rng, moments, size):
     omega = 2.0 * np.pi * frequency
 
     def change(values, time_s):
-        return values + amplitude * np.sin(omega * (time_s + _CYCLE_S * np.arange(len(values))))
+        return values + amplitude * np.sin(omega * (time_s + CYCLE_S * np.arange(len(values))))
 
     bus = during(alter(wire.CURRENT, wire.CURRENT_Q, change), at)
     return Fault(f"{amplitude:.1f} A, {frequency:.0f} Hz", at, bus=bus)
@@ -306,7 +305,7 @@ def wheel_speed_noisy(rng, moments, size):
 
 @_family
 def motion_leaks(rng, moments, size):
-    """Angle and speed carry a share of the current, as a cable beside another does."""
+    """The angle carries a share of the current, as a cable beside another does."""
     share, at, kept = draw_signed(rng, 0.0005, 0.02), pick_sometime(rng, moments), [0.0]
 
     def read(values, _):
@@ -327,7 +326,7 @@ def hold_slips(rng, moments, size):
     by, at, lasts = draw_signed(rng, 0.2, 6.0), pick_clamped(rng, moments), draw_size(rng, 0.05, 20.0)
 
     def change(values, time_s):
-        times = time_s + _CYCLE_S * np.arange(len(values))
+        times = time_s + CYCLE_S * np.arange(len(values))
         return values + by * np.clip((times - at) / lasts, 0.0, 1.0)
 
     return Fault(f"{by:+.2f} rad in {lasts:.1f} s", at, bus=during(_resolver(lambda _: change, _RESOLVER[:1]), at))

@@ -196,18 +196,31 @@ def _seconds(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.1f}"
 
 
+def _families(given: str | None, usual: Iterable[str]) -> list[str]:
+    """Names of families that are ``given``, comma-separated, or by the module that holds them; the ``usual`` ones if none are.
+
+    Raises:
+        InputError: an unknown name."""
+    from studies import senders, unlisted
+    from studies.grid import FAMILIES
+
+    modules = {"unlisted": unlisted.FAMILIES, "senders": senders.FAMILIES}
+    chosen = [family for name in given.split(",") for family in modules.get(name, [name])] if given else list(usual)
+    if unknown := sorted(set(chosen) - set(FAMILIES)):
+        raise InputError(
+            f"fault {', '.join(unknown)}: expected {', '.join(modules)} for all of those, or {', '.join(FAMILIES)}"
+        )
+    return chosen
+
+
 def grid(arguments: argparse.Namespace) -> int:
     """Drives of the simulated car; returns the number of phases that fail."""
-    from studies import faults, unlisted
-    from studies.grid import FAMILIES, brake_of, pairs_of, run_grid
+    from studies import faults
+    from studies.grid import brake_of, pairs_of, run_grid
 
     brake_of(arguments.stranger)
 
-    chosen = (arguments.faults or arguments.pair or ",".join(faults.FAMILIES)).split(",")
-    if chosen == ["unlisted"]:
-        chosen = list(unlisted.FAMILIES)
-    if unknown := sorted(set(chosen) - set(FAMILIES)):
-        raise InputError(f"fault {', '.join(unknown)}: expected unlisted for all of those, or {', '.join(FAMILIES)}")
+    chosen = _families(arguments.faults or arguments.pair, faults.FAMILIES)
     if arguments.pair:
         tasks = [(tuple(chosen), number) for number in range(arguments.first, arguments.first + arguments.count)]
     else:
@@ -225,13 +238,12 @@ def grid(arguments: argparse.Namespace) -> int:
 
 def injected(arguments: argparse.Namespace) -> int:
     """A log with faults in its frames; returns the number of phases that fail."""
+    from studies import faults, unlisted
     from studies.grid import FAMILIES
     from studies.injected import judge_injected
 
     calibration = load_calibration(arguments.calibration)
-    chosen = arguments.faults.split(",") if arguments.faults else list(FAMILIES)
-    if unknown := sorted(set(chosen) - set(FAMILIES)):
-        raise InputError(f"fault {', '.join(unknown)}: expected {', '.join(FAMILIES)}")
+    chosen = _families(arguments.faults, faults.FAMILIES | unlisted.FAMILIES)
     begun, begin_ns = time.monotonic(), int(read_frames(arguments.log)["time_ns"][0])
 
     def run(frames):
@@ -286,7 +298,9 @@ def main(argv: list[str] | None = None) -> int:
     logs.add_argument("--json", action="store_true")
     logs.set_defaults(run=service)
     drives = commands.add_parser("grid", help="drives of our own simulated car")
-    drives.add_argument("--faults", metavar="NAME,NAME", help="only these families, or all `unlisted`, and no pairs")
+    drives.add_argument(
+        "--faults", metavar="NAME,NAME", help="only these families, or all of `unlisted` or `senders`, and no pairs"
+    )
     drives.add_argument("--pair", metavar="NAME,NAME", help="only drives with both of these")
     drives.add_argument("--count", type=int, default=18, metavar="N", help="drives of each family (default 18)")
     drives.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default 0)")
@@ -301,7 +315,7 @@ def main(argv: list[str] | None = None) -> int:
     inside = commands.add_parser("injected", help="a log of any brake, with faults put into its frames")
     inside.add_argument("log", type=Path, metavar="LOG")
     inside.add_argument("--calibration", type=Path, metavar="FILE", required=True)
-    inside.add_argument("--faults", metavar="NAME,NAME", help="only these families")
+    inside.add_argument("--faults", metavar="NAME,NAME", help="only these, or all of `unlisted` or `senders`")
     inside.add_argument("--count", type=int, default=2, metavar="N", help="of each family (default 2)")
     inside.add_argument("--seed", type=int, default=1, metavar="S")
     inside.add_argument("--drives", action="store_true", help="print every fault")

@@ -20,8 +20,8 @@ TOUCHING_N = 200.0
 #: Rise of pads over that of their backing plates while heat is on its way: the pad's own resistance over that to the plate's
 #: surroundings.
 _BEHIND_PLATES = 4.0
-#: What pads of a car under way may have got that their plates do not show yet, K: as much as one stop from motorway speed or
-#: some from less heat a disc.
+#: By how much pads of a car under way may be hotter than their plates show yet, K: one stop from motorway speed, or some from
+#: less, heats a disc by as much.
 _UNDER_WAY_K = 100.0
 #: By which thermocouples of a brake at rest differ: their tolerance (IEC 60584, class 1: 1.5 K each) and noise, K.
 _PLATES_SPREAD_K = 3.0

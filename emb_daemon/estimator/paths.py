@@ -301,6 +301,7 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
         # drives the motor of an open brake, while that of a closed one follows pads and disc.
         s.friction_variance = min(sq(sqrt(variance) + _SLID * abs(s.friction_state - before)), 1.0)
     if slid == 0.0 and count > 0.0:
+        # The motor may have gone back within a count, and friction with it.
         other = within_count(s.friction_state, count, p.presliding_angle)
         mean = 0.5 * (s.friction_state + other)
         s.friction_variance = max(s.friction_variance, sq(mean - other))

@@ -128,6 +128,7 @@ STATE = np.dtype(
         # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late. What
         # effects have ``gained`` of thickness, m, and by how much that ``swelled`` or shrank in this sample.
         *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back gained swelled"),
+        # Steps of the angle, by which coarse counts are told.
         ("steps", STEPS),
         # Way (rad) that the gear has slid since it last turned back, with its sign, and the way before that.
         *fields("f8", "swing swing_before"),
