@@ -228,11 +228,13 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     """The same, or terms alone if these describe it more shortly, and leave less by what matters or are fewer causes without
     any further term.
 
-    An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds, and so may
-    one that has all that physics allows it, beside which no term may be found. It is then asked again beside the terms."""
+    An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds. It is then
+    asked again beside the terms. One that has all that physics allows it may be such a shadow even where it leaves nothing to
+    be found beside it, and gives way to terms that only describe as much more shortly."""
     suspects = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
     known = any(catalogue.candidates[name].in_calibration for name in suspects)
-    if found.accepted == catalogue.accepted:
+    at_limit = found.accepted == catalogue.accepted
+    if at_limit:
         suspects = [name for name in suspects if _is_at_limit(catalogue.model, name)]
     if not suspects or known:
         return found
@@ -247,7 +249,7 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     matters = gain > found.screening.floor(found.model, channel, made=True) ** 2
     fewer = len(_causes(both, channel)) < len(_causes(found, channel))
     fewer = fewer and len(_made(both, channel)) <= len(_made(found, channel))
-    return both if (matters or fewer) and _is_shorter(both, found, channel) else found
+    return both if (at_limit or matters or fewer) and _is_shorter(both, found, channel) else found
 
 
 def _is_at_limit(model: Model, name: str) -> bool:
