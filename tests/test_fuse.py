@@ -10,7 +10,7 @@ from emb_daemon.estimator import fuse, resolver, straying
 from emb_daemon.estimator.hypotheses import TORQUE_JUMP
 from emb_daemon.estimator.paths import FLICKER_RAD, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
-from emb_daemon.estimator.step import step
+from emb_daemon.estimator.step import _gained_since, step
 from emb_daemon.models.fusion import OF_THE_MODEL
 from emb_daemon.models.lateness import remember
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
@@ -112,6 +112,24 @@ def test_pads_that_stand_keep_the_force_that_their_way_there_has_left_them(param
         forces.append(float(s["drive"]))
     closing, _, released, stands = forces
     assert released < 0.99 * closing and stands == pytest.approx(released, rel=1e-6)
+
+
+def test_friction_of_a_standing_motor_is_halfway_between_what_a_coarse_count_hides(p, s, m):
+    """And as unsure as half of what lies between."""
+    p["presliding_angle"], s["friction_state"] = 0.5, 1.0
+    s["steps"]["least"], s["steps"]["most"], s["steps"]["number"] = 0.02, 0.02, 100
+    torque_path(s, p, m)
+    hidden = 1.0 - np.exp(-0.02 / 0.5)
+    assert s["friction_mean"] == pytest.approx(1.0 - hidden)
+    assert s["friction_variance"] == pytest.approx(hidden**2)
+
+
+def test_a_force_that_comes_a_cycle_late_is_as_sure_as_the_motor_was_slow(p, s):
+    """A motor that stands has kept its force; after two cycles it may have gone at its limit meanwhile."""
+    assert _gained_since(s, p, CYCLE_S) == pytest.approx(900.0 * 1.3 * 40.0 * CYCLE_S)
+    s["speed"], s["factor"], s["scale"], s["past_contact"] = 0.0, 1.0, 1.0, 10.0
+    assert _gained_since(s, p, CYCLE_S) == 0.0
+    assert _gained_since(s, p, 2.0 * CYCLE_S) > 900.0 * 40.0 * 2.0 * CYCLE_S
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.008])
