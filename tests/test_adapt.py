@@ -592,6 +592,13 @@ def test_poor_training_is_rejected(ideal, change, outcome):
     assert fit(trained_rows(ideal, **change), believed()).outcome == outcome
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_training_in_which_no_current_lasts_is_too_short(ideal):
+    rows = trained_rows(ideal)
+    rows["has_current"][::5] = False
+    assert fit(rows, believed()).outcome == r.TOO_FEW
+
+
 def test_implausible_outcomes_are_rejected(ideal):
     rows = trained_rows(ideal)
     noisy = rows.copy()

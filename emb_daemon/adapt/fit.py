@@ -75,7 +75,8 @@ _UNCHANGED = 16.0
 _LASTING = 2.0
 #: Lags over which the residual's autocorrelation inflates the covariance.
 _LAGS = 12
-#: Least number of samples of a training, four seconds; number of equal force ranges that must be passed in each direction.
+#: Least number of samples of a training, and of those that are in blocks whose torque is known, four seconds; number of equal
+#: force ranges that must be passed in each direction.
 _LEAST_SAMPLES, _RANGES = 1000, 5
 
 
@@ -411,6 +412,9 @@ def fit_training(
     if not np.all(np.isfinite(x)):
         return Evaluation(r.NOT_EXCITED, evidence={"samples": len(rows)})
     training = _Training(rows, calibration, state, scale)
+    known = _BLOCK * int(np.isfinite(training.simulate(x)[0]).sum())
+    if known < _LEAST_SAMPLES:
+        return Evaluation(r.TOO_FEW, evidence={"samples": known})
     fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"])
     x, sigmas = fit.x, np.sqrt(np.diag(fit.covariance))
     values, of_curve = _learned_values(training, fit, unchanged, base, highest - x[_CONTACT], factor_sigma)
