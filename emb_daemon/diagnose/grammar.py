@@ -59,6 +59,7 @@ _SHAPES = 3
 #: Share of what a term does (RMS) that one of another place must gain beside it: a power, or a memory, that is nearly right is
 #: wrong by some per cent, which then look like another cause.
 _BESIDE = 0.1
+_AT_LIMIT = "physics allows no more of it, and terms leave less"
 
 
 def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selection:
@@ -67,7 +68,9 @@ def make_terms(selection: Selection, progress: Callable[[str], None]) -> Selecti
         progress("making a term for the heat balance")
         selection = _with_heat_terms(selection)
     for channel in (channel for channel in selection.model.bench.channels if channel in LASTING):
-        if channel != CHANNEL_OF_HEAT and selection.model.own(channel) and _wanted(selection, channel):
+        if channel == CHANNEL_OF_HEAT or not selection.model.own(channel):
+            continue
+        if _wanted(selection, channel) or _at_limit(selection, channel):
             progress(f"making a term for the {channel} residual")
             found = _without_shadows(_with_terms(selection, channel), selection, channel)
             selection = _with_hidden(found, selection, channel)
@@ -229,33 +232,42 @@ def _without_shadows(found: Selection, catalogue: Selection, channel: str) -> Se
     any further term.
 
     An effect of the ``catalogue`` beside which a term had to be made may be the shadow of what no catalogue holds. It is then
-    asked again beside the terms. One that has all that physics allows it may be such a shadow even where it leaves nothing to
-    be found beside it, and gives way to terms that only describe as much more shortly."""
-    suspects = [name for name in catalogue.accepted if catalogue.channel_of(name) == channel]
-    known = any(catalogue.candidates[name].in_calibration for name in suspects)
+    asked again beside the terms. One that has all that physics allows it, and would explain more with more, is not the cause
+    even where it leaves nothing to be found beside it: it gives way to as many terms that leave less."""
     at_limit = found.accepted == catalogue.accepted
-    if at_limit:
-        suspects = [name for name in suspects if _is_at_limit(catalogue.model, name)]
+    suspects = _at_limit(catalogue, channel) if at_limit else _of_channel(catalogue, channel)
+    known = any(catalogue.candidates[name].in_calibration for name in _of_channel(catalogue, channel))
     if not suspects or known:
         return found
     bare = catalogue
     for name in suspects:
-        bare = bare.without(name, "explains less than terms without it, and nothing beside them")
+        bare = bare.without(name, _AT_LIMIT if at_limit else "explains less than terms without it, and nothing beside them")
     terms = _with_terms(bare, channel)
     if terms.accepted == bare.accepted:
         return found
-    both = one_round(replace(terms, dropped=catalogue.dropped))
+    both = terms if at_limit else one_round(replace(terms, dropped=catalogue.dropped))
     gain = found.model.noise(channel) - both.model.noise(channel)
+    more = len(_causes(both, channel)) - len(_causes(found, channel))
+    if at_limit:
+        return both if gain > 0.0 and more <= 0 else found
     matters = gain > found.screening.floor(found.model, channel, made=True) ** 2
-    fewer = len(_causes(both, channel)) < len(_causes(found, channel))
-    fewer = fewer and len(_made(both, channel)) <= len(_made(found, channel))
-    return both if (at_limit or matters or fewer) and _is_shorter(both, found, channel) else found
+    fewer = more < 0 and len(_made(both, channel)) <= len(_made(found, channel))
+    return both if (matters or fewer) and _is_shorter(both, found, channel) else found
 
 
-def _is_at_limit(model: Model, name: str) -> bool:
-    """Whether a fit has left an amplitude of an effect at a bound that is not nothing."""
-    own = [c for c in model.of_effect(name) if not is_shape(c)]
-    return any(abs(model.values[c]) >= c.step and c.is_held(model.values[c]) for c in own)
+def _of_channel(selection: Selection, channel: str) -> list[str]:
+    return [name for name in selection.accepted if selection.channel_of(name) == channel]
+
+
+def _at_limit(selection: Selection, channel: str) -> list[str]:
+    """Names of accepted effects of a channel of which a fit has left an amplitude at a bound that is not nothing."""
+    values = selection.model.values
+
+    def is_at_limit(name: str) -> bool:
+        own = [c for c in selection.model.of_effect(name) if not is_shape(c)]
+        return any(abs(values[c]) >= c.step and c.is_held(values[c]) for c in own)
+
+    return [name for name in _of_channel(selection, channel) if is_at_limit(name)]
 
 
 def _with_hidden(found: Selection, catalogue: Selection, channel: str) -> Selection:
@@ -284,7 +296,8 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
         bare = selection.without(term, "an effect of the catalogue says the same")
         proven = selection.candidates[term]
         # What acts in the same place and follows the same signal first: most others make up for what the fits do not reach.
-        for known in sorted(find_known(bare, channel), key=lambda c: (c.effect.hook, (c.effect.signal,)) != _place(proven)):
+        possible = [c for c in find_known(bare, channel) if selection.candidates[c.effect.name].reason != _AT_LIMIT]
+        for known in sorted(possible, key=lambda c: (c.effect.hook, (c.effect.signal,)) != _place(proven)):
             known = replace(known, names=term, p_value=proven.p_value, q_value=proven.q_value)
             named = bare.entered([known])
             named = replace(named, model=named.model.arrived(channel))
