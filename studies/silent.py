@@ -35,6 +35,7 @@ from studies.phases import (
     LEARNED_USEFUL,
     NOMINAL_USEFUL,
     NOMINAL_WORSE,
+    POWER_ON_S,
     Phase,
     first_flag_s,
     judge,
@@ -51,8 +52,6 @@ _HEALED = ("pads_6p5mm", "compound_stiffer", "contact_plus_40um", "current_offse
 _NOMINAL_RMSE_N = {"before": 31.5, "training": 35.5, "after": 34.7}
 #: Between these lines of docs/safety.md stands the table that `grid --table` writes.
 _BEGIN, _END = "<!-- detection times: begin -->", "<!-- detection times: end -->"
-#: Flags within this time, s, are due to power-on: slow inputs have not been received yet.
-_POWER_ON_S = 0.5
 
 
 def run_frames(path: Path, calibration, frames: np.ndarray, begin_ns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,7 +105,7 @@ def service(arguments: argparse.Namespace) -> int:
             continue
         time_s, estimates, force_N = run_log(path, calibration, arguments.cut)
         phases = judge_log(name, time_s, estimates, force_N, path.parent.name == "service")
-        onset = max(_ONSET_S.get(name, 0.0), time_s[0] + _POWER_ON_S)
+        onset = max(_ONSET_S.get(name, 0.0), time_s[0] + POWER_ON_S)
         flagged_s = first_flag_s(time_s, estimates, onset)
         report.append({"log": name, "first_flag_s": flagged_s, "phases": [phase.as_dict() for phase in phases]})
         failing += sum(bool(phase.failed) for phase in phases)
