@@ -21,7 +21,7 @@ from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.logs.write import write_frames
-from emb_daemon.offline import load_log
+from emb_daemon.offline import Log, load_log
 from emb_daemon.wire.contract import E2E_ERROR
 
 
@@ -133,30 +133,29 @@ def test_columns_and_channels_are_logs(truth, tmp_path, name):
     assert samples["time_ns"][0] * 1e-9 - start_s == pytest.approx(columns["time_s"][0], abs=1e-6)
 
 
-@pytest.mark.parametrize(("ending", "mark"), [("txt", " "), ("csv", ","), ("tsv", "\t"), ("dat", ";")])
-def test_a_table_without_header_has_its_columns_by_number(tmp_path, ending, mark):
-    """As microcontrollers print it: numbers alone, in a file called anything."""
-    foreignkit.write_rig(tmp_path, _by_place())
-    (tmp_path / f"a.{ending}").write_text(_table(100).replace(",", mark))
-    samples = load_mapped(tmp_path / f"a.{ending}").samples
-    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
+def _read_text(folder, text: str, mapping: str = foreignkit.COLUMNS, name: str = "a.csv") -> Log:
+    """The log of a table that is a text."""
+    foreignkit.write_rig(folder, mapping)
+    (folder / name).write_text(text, encoding="utf-8", newline="")
+    return load_mapped(folder / name)
 
 
 @pytest.mark.parametrize(
-    ("before", "after"), [("0.6\n", ""), ("0.6\ndata = [7 7 7 7 7 7\n", "];\n"), ("data = [7 7 7 7 7 7\n", "]")]
+    ("name", "mark", "before", "after"),
+    [
+        ("a.txt", " ", "", ""),
+        ("a.csv", ",", "", ""),
+        ("a.tsv", "\t", "", ""),
+        ("a.dat", ";", "", ""),
+        ("a.m", " ", "0.6\n", ""),
+        ("a.m", " ", "0.6\ndata = [7 7 7 7 7 7\n", "];\n"),
+        ("a.m", " ", "data = [7 7 7 7 7 7\n", "]"),
+    ],
 )
-def test_a_matrix_of_a_script_has_its_columns_by_number(tmp_path, before, after):
-    """As a program prints it for MATLAB, below a number of its own."""
-    foreignkit.write_rig(tmp_path, _by_place())
-    (tmp_path / "a.m").write_text(before + _table(100).replace(",", " ") + after)
-    samples = load_mapped(tmp_path / "a.m").samples
-    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4)
-
-
-def test_a_table_may_have_decimal_commas(tmp_path):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    (tmp_path / "a.csv").write_text(f"{_HEADER}\n{_table(100)}".replace(",", ";").replace(".", ","))
-    samples = load_mapped(tmp_path / "a.csv").samples
+def test_a_table_without_header_has_its_columns_by_number(tmp_path, name, mark, before, after):
+    """As microcontrollers print it: numbers alone, in a file called anything; and as a program prints a matrix for MATLAB,
+    below a number of its own."""
+    samples = _read_text(tmp_path, before + _table(100).replace(",", mark) + after, _by_place(), name).samples
     assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
 
 
@@ -205,18 +204,17 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (f"{_HEADER}\ns,rad,rad/s,A,degC,g\n\n{_table(100)}", "force_N says g and is taken in N: which is right?"),
         (_OF_LINES + _table(100, "{t:.3f},1,{a:.1f},25.0,1.5,22,0"), ""),
         ((_HEADER + "\n" + _table(100)).replace(",", "\r,").replace("\n", "\r\n"), ""),
+        ((_HEADER + "\n" + _table(100)).replace(",", ";").replace(".", ","), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
         "two headers", "segments", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside",
         "late decimal commas", "quotes after blanks", "a typesetter's minus", "more names than cells",
-        "units above an empty line", "names of several lines", "columns put side by side",
+        "units above an empty line", "names of several lines", "columns put side by side", "decimal commas",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    (tmp_path / "a.csv").write_text(content, encoding="utf-8", newline="")
-    samples = load_mapped(tmp_path / "a.csv").samples
+    samples = _read_text(tmp_path, content).samples
     assert np.allclose(samples["angle"][:100], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
     told = capsys.readouterr().err
     assert said in told and any(word in told for word in ("left out", "header", "which is right")) == bool(said)
@@ -242,14 +240,13 @@ def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, conte
     ],
 )
 def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}"))
+    mapping = foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}")
     rows = (
         stamp.format(s=10.0 + 0.004 * n, whole=10, ms=4 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n, part=part)
         for n, part in ((n, (800_000_000 + 4_000_000 * n) % 1_000_000_000) for n in range(100))
     )
     table = "".join(f"{time},{0.1 * n:.1f},25.0,1.5,22,0\n" for n, time in enumerate(rows))
-    (tmp_path / "a.csv").write_text(f"{_HEADER}\n{table}")
-    log = load_mapped(tmp_path / "a.csv")
+    log = _read_text(tmp_path, f"{_HEADER}\n{table}", mapping)
     assert np.allclose(log.time_s, 0.004 * np.arange(100), atol=1e-6)
 
 
@@ -258,8 +255,6 @@ def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
     [(";", ",", "."), (";", ",", " "), (";", ".", "'"), (",", ".", ","), (";", ",", "\u00a0")],
 )
 def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", "{signal: time_s, unit: ms}"))
-
     def number(value: float) -> str:
         text = f"{value:,.1f}".translate(str.maketrans({",": group, ".": decimal}))
         return f'"{text}"' if delimiter == "," else text
@@ -268,8 +263,8 @@ def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
         delimiter.join(map(number, (4.0 * n, 0.1 * n, 25.0, 1.5, 22.0, 1500.0 + 10.0 * (n % 2) - 900.0 * (n % 3 == 0))))
         for n in range(400)
     ]
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER.replace(",", delimiter), *rows]) + "\n")
-    log = load_mapped(tmp_path / "a.csv")
+    mapping = foreignkit.COLUMNS.replace("{signal: time_s}", "{signal: time_s, unit: ms}")
+    log = _read_text(tmp_path, "\n".join([_HEADER.replace(",", delimiter), *rows]) + "\n", mapping)
     assert np.allclose(log.time_s, 0.004 * np.arange(400), atol=1e-6)
     assert set(np.round(log.force_N).tolist()) == {600.0, 610.0, 1500.0, 1510.0}
 
@@ -277,20 +272,16 @@ def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
 @pytest.mark.parametrize(("whole", "largest_N"), [(1, 20_399.0), (0, 19.399)], ids=["thousands", "decimals"])
 def test_a_point_beside_decimal_commas_parts_thousands(tmp_path, whole, largest_N):
     """As a spreadsheet of such a country shows whole newtons; nobody writes thousands that begin with a zero."""
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     rows = [
         f"{0.004 * n:.3f};{0.1 * n:.1f};25,0;1,5;22,0".replace(".", ",") + f";{whole + n % 20}.{n:03d}" for n in range(400)
     ]
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER.replace(",", ";"), *rows]) + "\n")
-    log = load_mapped(tmp_path / "a.csv")
+    log = _read_text(tmp_path, "\n".join([_HEADER.replace(",", ";"), *rows]) + "\n")
     assert np.nanmax(log.force_N) == pytest.approx(largest_N, abs=0.2)
 
 
 def test_what_a_tool_says_of_an_instrument_out_of_range_is_no_value(tmp_path, capsys):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     rows = [f"{0.004 * n:.3f},{0.1 * n:.1f},25.0,1.5,22,{'OVER' if n % 10 < 3 else '100'}" for n in range(300)]
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER, *rows]) + "\n")
-    log = load_mapped(tmp_path / "a.csv")
+    log = _read_text(tmp_path, "\n".join([_HEADER, *rows]) + "\n")
     assert "90 cells are no numbers, left out, the first of them 'OVER'" in capsys.readouterr().err
     assert np.nanmax(np.abs(log.force_N - 100.0)) < 1.0 and len(log.samples) == 300
 
@@ -298,23 +289,17 @@ def test_what_a_tool_says_of_an_instrument_out_of_range_is_no_value(tmp_path, ca
 def test_a_table_is_one_whatever_it_is_called(tmp_path, capsys):
     """A text called .log, its header behind a mark; a column that is missed is told by name, units in its name or not."""
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    rows = "".join(f"{0.004 * n:.3f},{0.1 * n:.1f},25.0,1.5,22,0\n" for n in range(100))
-    (tmp_path / "a.log").write_text(f"# bench 4\n#{_HEADER}\n{rows}")
-    mapping = Mapping(tmp_path / "mapping.yaml")
-    assert len(load_log(tmp_path / "a.log", read=mapping.read).samples) == 100
+    text, mapping = f"# bench 4\n#{_HEADER}\n{_table(100)}", Mapping(tmp_path / "mapping.yaml")
+    assert len(_read_text(tmp_path, text, name="a.log").samples) == 100
     named = ",".join(f"{name} [x]" for name in _HEADER.split(","))
-    (tmp_path / "b.csv").write_text(f"{named.replace('time_s [x]', 'time_s')}\n{rows}")
+    (tmp_path / "b.csv").write_text(f"{named.replace('time_s [x]', 'time_s')}\n{_table(100)}")
     with pytest.raises(InputError, match=r"no such column; the table has time_s, angle_rad \[x\], speed_rad_per_s \[x\]"):
         mapping.read(tmp_path / "b.csv")
-    (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("signal: time_s", "signal: '#time_s'"))
-    assert len(load_mapped(tmp_path / "a.log").samples) == 100
-    for binary, said in (
-        (b"PK\x03\x04", "not readable"),
-        (b"\x89HDF", "not readable"),
-        (b"a\rb\n", "not readable"),
-    ):
+    marked = foreignkit.COLUMNS.replace("signal: time_s", "signal: '#time_s'")
+    assert len(_read_text(tmp_path, text, marked, "a.log").samples) == 100
+    for binary in (b"PK\x03\x04", b"\x89HDF", b"a\rb\n"):
         (tmp_path / "c.csv").write_bytes(binary + bytes(100))
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match="not readable"):
             mapping.read(tmp_path / "c.csv")
 
 
@@ -477,8 +462,7 @@ def _written(path: Path, variables: dict) -> Path:
 
 @pytest.mark.parametrize("ending", [".mat", ".npz"])
 def test_variables_of_matlab_and_numpy_are_columns(columns, tmp_path, ending):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    plain = load_mapped(foreignkit.write_table(tmp_path / "a.parquet", columns))
+    plain = read(tmp_path, columns)
     path = _written(tmp_path / f"a{ending}", columns | {"rate": 250.0, "rig": "A", "plate_C": columns["plate_C"].astype(int)})
     _assert_same(load_mapped(path).samples, plain.samples)
     motion = np.column_stack([columns["angle_rad"], columns["speed_rad_per_s"]])
@@ -610,9 +594,7 @@ def test_topics_of_several_senders_in_one_table_keep_their_own_times(columns, tm
         angle, speed, current, plate, force = (f"{columns[name][n]:.6g}" for name in _HEADER.split(",")[1:])
         rows += [f"{time_s:.6f},{angle},{speed},,,", f"{time_s + 3e-4:.6f},,,{current},,"]
         rows += [f"{time_s + 7e-4:.6f},,,,{plate},{force}"] * (n % 5 == 0)
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER, *rows]) + "\n")
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    samples = load_mapped(tmp_path / "a.csv").samples
+    samples = _read_text(tmp_path, "\n".join([_HEADER, *rows]) + "\n").samples
     assert "bunches" not in capsys.readouterr().err
     assert len(samples) == len(columns["time_s"])
     assert np.abs(samples["angle"] - columns["angle_rad"]).max() < 1e-3
@@ -689,8 +671,7 @@ def _as_file(path: Path, columns: dict[str, np.ndarray]) -> Path:
 @pytest.mark.parametrize("ending", [".xlsx", ".h5", ".mat", ".tdms", ".json", ".jsonl", ".ndjson", ".feather", ".npy"])
 def test_a_table_is_the_same_in_every_format(columns, tmp_path, capsys, ending):
     """The format goes by how the file begins where that tells it, not by its name."""
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    plain = load_mapped(foreignkit.write_table(tmp_path / "a.parquet", columns))
+    plain = read(tmp_path, columns)
     mapping = foreignkit.COLUMNS
     for place, name in enumerate(columns, 1):
         theirs = {".npy": f"column {place}", ".feather": name, ".xlsx": name}.get(ending, f"log.{name}")
@@ -894,9 +875,7 @@ def test_variables_that_are_no_table_are_refused(columns, tmp_path):
 
 def test_columns_are_called_by_their_place_where_names_do_not_tell(columns, tmp_path):
     """Two instruments in one table, each with its times, as an acquisition tool writes them; a first value that is none."""
-    table = foreignkit.write_table(tmp_path / "a.parquet", columns)
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    plain = load_mapped(table)
+    plain = read(tmp_path, columns)
     names, values = list(columns), [*columns.values(), columns["time_s"]]
     rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
     tool = 'Timestamp,2020-03-16 17:04:51,Unit,"V"\nInterval,0.004\n'
@@ -984,20 +963,17 @@ def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):
     assert expected in line
 
 
-@pytest.mark.parametrize(("load", "missed"), [("{value: 0}", 1), ("{signal: force_N, unit: N}", 4)], ids=["none", "measured"])
+@pytest.mark.parametrize(("load", "missed"), [("value: 0", 1), ("signal: force_N, unit: N", 4)], ids=["none", "measured"])
 def test_of_a_machine_that_clamps_nothing_no_brakes_messages_are_missed(tmp_path, load, missed):
-    signals = "EMB_FL_Resolver.MotorAngle: {signal: angle_rad, unit: rad}", f"RIG_FL_Force.ClampForceRef: {load}"
-    text = "\n  ".join(["format: 1\ntime: {signal: time_s}\nsignals:", *signals])
-    (tmp_path / "mapping.yaml").write_text(text + "\n")
-    notes = [note for note in Mapping(tmp_path / "mapping.yaml").notes if "is not mapped" in note]
+    signals = {"MotorAngle": "signal: angle_rad, unit: rad", "ClampForceRef": load}
+    notes = [n for n in write_mapping(tmp_path, "time: {signal: time_s}", **signals).notes if "is not mapped" in n]
     assert len(notes) == missed and "EMB_FL_Current" in notes[0]
 
 
 @pytest.mark.parametrize(("unit", "newton"), [("kgf", 9.80665), ("kg", 9.80665), ("lbf", 4.448222), ("daN", 10.0)])
 def test_a_load_cell_may_speak_of_the_mass_that_weighs_so_much(columns, tmp_path, unit, newton):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", f"force_N, unit: {unit}"))
-    table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"force_N": columns["force_N"] / newton})
-    force = load_mapped(table).force_N
+    mapping = foreignkit.COLUMNS.replace("force_N, unit: N", f"force_N, unit: {unit}")
+    force = read(tmp_path, columns | {"force_N": columns["force_N"] / newton}, mapping).force_N
     assert np.nanmax(force) == pytest.approx(np.nanmax(columns["force_N"]), rel=1e-3)
 
 
@@ -1015,10 +991,10 @@ def _without(text: str, *words: str) -> str:
         ("WheelSpeed", "VEH_WheelSpeed is not mapped: the disc may be turning", {"wheel speed lost"}, 120.0),
     ],
 )
-def test_what_is_missing_is_said_and_the_rest_goes_on(truth, tmp_path, capsys, left_out, said, reasons, most_N):
+def test_what_is_missing_is_said_and_the_rest_goes_on(columns, tmp_path, capsys, left_out, said, reasons, most_N):
     """As far as the physics allows, and with a sigma that holds."""
     foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, left_out))
-    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(truth, 250.0))
+    table = foreignkit.write_table(tmp_path / "stops.parquet", columns)
     figures, notes = _replay(tmp_path, table, capsys)
     assert said in notes
     assert {word for word, share in figures["reasons"].items() if share > 0.9} == reasons
@@ -1054,9 +1030,9 @@ def test_neither_status_nor_current_is_said(tmp_path, capsys):
     assert "the force stays unknown; of a bench say so by `value: 0`" in capsys.readouterr().err
 
 
-def test_a_rig_without_reference_is_judged_by_nothing(truth, tmp_path, capsys):
+def test_a_rig_without_reference_is_judged_by_nothing(columns, tmp_path, capsys):
     foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, "RIG_"))
-    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(truth, 250.0))
+    table = foreignkit.write_table(tmp_path / "stops.parquet", columns)
     out = tmp_path / "out.parquet"
     figures, _ = _replay(tmp_path, table, capsys, "--output", out)
     assert figures["force_N"] == {} and figures["temperature_K"] == {}
