@@ -27,11 +27,11 @@ from emb_daemon.pipeline import Pipeline
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
-from emb_daemon.wire.contract import CYCLE_S, RESULT_ACCEPTED
+from emb_daemon.wire.contract import CYCLE_S
 from studies import faults, senders, unlisted
 from studies.drives import park_on_latch
 from studies.faults import LEARNED, NOMINAL, Fault, Size, size_of
-from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, first_flag_s, judge
+from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, POWER_ON_S, judge, verdict
 from studies.strangers import draw_stranger
 
 #: Faults that drives may have.
@@ -40,8 +40,6 @@ FAMILIES = faults.FAMILIES | unlisted.FAMILIES | senders.FAMILIES
 _PARK_S = 34.0
 #: Cycles of a stretch: training ends if the car receives no request of the daemon for 25.
 _STRETCH = 20
-#: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet.
-_POWER_ON_S = 0.5
 #: Radius of our own car's wheels, m, and of a stranger's: they turn no faster than its campaign's, up to 60 rad/s, beyond
 #: which a drawn effect that grows with speed or friction power has never been seen.
 _WHEEL_M, _STRANGERS_WHEEL_M = 0.31, 0.42
@@ -273,7 +271,7 @@ def judge_drive(names: tuple[str, ...], number: int, seed: int, stranger: Path |
     """Verdict of one drive."""
     fault, moments, estimates, force_N = drive(names, number, seed, stranger)
     time_s = 1e-9 * estimates["time_ns"]
-    onset = max(fault.onset_s, *(at + off + _POWER_ON_S for at, off in ((0.0, fault.power_on_s), *fault.restarts)))
+    onset = max(fault.onset_s, *(at + off + POWER_ON_S for at, off in ((0.0, fault.power_on_s), *fault.restarts)))
     park, after = moments["park"], moments["after"]
     parked = [(moments[name], moments[name] + _PARK_S) for name in ("park_0", "park") if name in moments]
     begun = time_s >= min(fault.onset_s, park)
@@ -294,15 +292,7 @@ def judge_drive(names: tuple[str, ...], number: int, seed: int, stranger: Path |
         elif LEARNED.issuperset(names) and phase == "after" and fault.onset_s < park - _LEARNING_S:
             useful, rmse_N = LEARNED_USEFUL, LEARNED_RMSE_N
         phases.append(judge(phase, time_s[rows], estimates[rows], force_N[rows], useful, rmse_N))
-    return {
-        "family": " + ".join(names),
-        "number": number,
-        "size": fault.size,
-        "onset_s": fault.onset_s,
-        "trained": int((np.diff((estimates["adapt_result"] == RESULT_ACCEPTED).astype(int)) > 0).sum()),
-        "first_flag_s": first_flag_s(time_s, estimates, onset),
-        "phases": [phase.as_dict() for phase in phases],
-    }
+    return verdict(" + ".join(names), number, fault, time_s, estimates, onset, phases)
 
 
 def pairs_of(count: int, seed: int, names: list[str]) -> list[tuple[str, str]]:

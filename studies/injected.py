@@ -15,21 +15,20 @@ from emb_daemon.calibration.types import Calibration
 from emb_daemon.errors import InputError
 from emb_daemon.logs.read import read_frames
 from emb_daemon.offline import load_log
+from emb_daemon.offline.stretches import stretches_of
 from studies.faults import size_of
-from studies.phases import first_flag_s, judge
+from studies.phases import POWER_ON_S, judge, verdict
 
 #: Frames that a fault sees at once, s.
 _STRETCH_S = 0.08
-#: Flags of the first moments after power-on, s, are of slow inputs that were not heard yet.
-_POWER_ON_S = 0.5
 #: The pads touch above this share of the log's largest force; a stop lasts, and pads are open, at least this long, s.
 _TOUCHING, _STOP_S, _OPEN_S = 0.05, 1.5, 2.0
 
 
 def _spells(mask: np.ndarray, time_s: np.ndarray, least_s: float) -> list[float]:
     """Where stretches of ``mask`` begin that last ``least_s``, s."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
-    begin, end = time_s[edges[::2]], time_s[edges[1::2] - 1]
+    first, after = stretches_of(mask).T
+    begin, end = time_s[first], time_s[after - 1]
     return begin[end - begin >= least_s].tolist()
 
 
@@ -72,12 +71,5 @@ def judge_injected(
     begun = time_s >= fault.onset_s
     spans = {"before": ~begun, "after": begun}
     phases = [judge(phase, time_s[rows], estimates[rows], force_N[rows]) for phase, rows in spans.items() if rows.any()]
-    return {
-        "family": name,
-        "number": number,
-        "size": fault.size,
-        "onset_s": fault.onset_s,
-        "trained": 0,
-        "first_flag_s": first_flag_s(time_s, estimates, max(fault.onset_s, fault.power_on_s + _POWER_ON_S)),
-        "phases": [phase.as_dict() for phase in phases],
-    }
+    onset = max(fault.onset_s, fault.power_on_s + POWER_ON_S)
+    return verdict(name, number, fault, time_s, estimates, onset, phases)

@@ -9,7 +9,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from emb_daemon.offline.score import rmse
-from emb_daemon.wire.contract import ADAPTING, FUSED, INIT, INVALID, RUNNING
+from emb_daemon.offline.stretches import stretches_of
+from emb_daemon.wire.contract import ADAPTING, FUSED, INIT, INVALID, RESULT_ACCEPTED, RUNNING
+from studies.faults import Fault
 
 #: Noise of the reference force sensor, N, which sigma need not cover.
 REFERENCE_SIGMA_N = 25.0
@@ -20,6 +22,8 @@ LARGE_N, LONGEST_LARGE_S, SILENT_LARGE = 1000.0, 0.1, 1 / 2000
 #: change was learned; RMSE after it was learned, and with nothing wrong over what it was before.
 USEFUL_SIGMA_N, NOMINAL_USEFUL, LEARNED_USEFUL, LEARNED_RMSE_N, NOMINAL_WORSE = 300.0, 0.99, 0.90, 100.0, 1.10
 _RUNNING_MODES = (RUNNING, ADAPTING)
+#: Flags within this time, s, are due to power-on: slow inputs have not been received yet.
+POWER_ON_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,22 @@ class Phase:
         return asdict(self)
 
 
+def verdict(
+    family: str, number: int, fault: Fault, time_s: np.ndarray, estimates: np.ndarray, onset_s: float, phases: list[Phase]
+) -> dict:
+    """What is told of a drive with a fault; its flags count from ``onset_s`` on."""
+    accepted = (estimates["adapt_result"] == RESULT_ACCEPTED).astype(int)
+    return {
+        "family": family,
+        "number": number,
+        "size": fault.size,
+        "onset_s": fault.onset_s,
+        "trained": int((np.diff(accepted) > 0).sum()),
+        "first_flag_s": first_flag_s(time_s, estimates, onset_s),
+        "phases": [phase.as_dict() for phase in phases],
+    }
+
+
 def _share(mask: np.ndarray, of: np.ndarray) -> float:
     count = int(of.sum())
     return float((mask & of).sum() / count) if count else 0.0
@@ -60,10 +80,8 @@ def _share(mask: np.ndarray, of: np.ndarray) -> float:
 
 def _longest(mask: np.ndarray, time_s: np.ndarray) -> float:
     """Longest time that ``mask`` lasts, in s; 0 for a single sample."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
-    if not len(edges):
-        return 0.0
-    return float(np.max(time_s[edges[1::2] - 1] - time_s[edges[::2]]))
+    first, after = stretches_of(mask).T
+    return float(np.max(time_s[after - 1] - time_s[first], initial=0.0))
 
 
 def judge(

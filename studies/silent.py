@@ -35,6 +35,7 @@ from studies.phases import (
     LEARNED_USEFUL,
     NOMINAL_USEFUL,
     NOMINAL_WORSE,
+    POWER_ON_S,
     Phase,
     first_flag_s,
     judge,
@@ -51,8 +52,6 @@ _HEALED = ("pads_6p5mm", "compound_stiffer", "contact_plus_40um", "current_offse
 _NOMINAL_RMSE_N = {"before": 31.5, "training": 35.5, "after": 34.7}
 #: Between these lines of docs/safety.md stands the table that `grid --table` writes.
 _BEGIN, _END = "<!-- detection times: begin -->", "<!-- detection times: end -->"
-#: Flags within this time, s, are due to power-on: slow inputs have not been received yet.
-_POWER_ON_S = 0.5
 
 
 def run_frames(path: Path, calibration, frames: np.ndarray, begin_ns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,7 +105,7 @@ def service(arguments: argparse.Namespace) -> int:
             continue
         time_s, estimates, force_N = run_log(path, calibration, arguments.cut)
         phases = judge_log(name, time_s, estimates, force_N, path.parent.name == "service")
-        onset = max(_ONSET_S.get(name, 0.0), time_s[0] + _POWER_ON_S)
+        onset = max(_ONSET_S.get(name, 0.0), time_s[0] + POWER_ON_S)
         flagged_s = first_flag_s(time_s, estimates, onset)
         report.append({"log": name, "first_flag_s": flagged_s, "phases": [phase.as_dict() for phase in phases]})
         failing += sum(bool(phase.failed) for phase in phases)
@@ -295,7 +294,6 @@ def main(argv: list[str] | None = None) -> int:
     logs.add_argument("--logs", metavar="NAME,NAME", help="only these logs of the folder")
     logs.add_argument("--cut", type=float, default=0.0, metavar="T", help="begin T s into the log: power comes in the middle")
     logs.add_argument("--calibration", type=Path, metavar="FILE", help="default: the shipped one, of the simulated rig A")
-    logs.add_argument("--json", action="store_true")
     logs.set_defaults(run=service)
     drives = commands.add_parser("grid", help="drives of our own simulated car")
     drives.add_argument(
@@ -306,10 +304,7 @@ def main(argv: list[str] | None = None) -> int:
     drives.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default 0)")
     drives.add_argument("--pairs", type=int, metavar="N", help="drives with two faults (default 100, none with --faults)")
     drives.add_argument("--stranger", type=Path, metavar="DIR/SEED", help="a brake of `studies.strangers`, not our own")
-    drives.add_argument("--seed", type=int, default=1, metavar="S")
     drives.add_argument("--processes", type=int, default=2, metavar="N")
-    drives.add_argument("--drives", action="store_true", help="print every drive")
-    drives.add_argument("--json", action="store_true")
     drives.add_argument("--table", type=Path, metavar="FILE.md", help="write the table of detection times into this page")
     drives.set_defaults(run=grid)
     inside = commands.add_parser("injected", help="a log of any brake, with faults put into its frames")
@@ -317,11 +312,12 @@ def main(argv: list[str] | None = None) -> int:
     inside.add_argument("--calibration", type=Path, metavar="FILE", required=True)
     inside.add_argument("--faults", metavar="NAME,NAME", help="only these, or all of `unlisted` or `senders`")
     inside.add_argument("--count", type=int, default=2, metavar="N", help="of each family (default 2)")
-    inside.add_argument("--seed", type=int, default=1, metavar="S")
-    inside.add_argument("--drives", action="store_true", help="print every fault")
-    inside.add_argument("--json", action="store_true")
     inside.set_defaults(run=injected)
+    for command in (drives, inside):
+        command.add_argument("--seed", type=int, default=1, metavar="S")
+        command.add_argument("--drives", action="store_true", help="print every drive")
     for command in (logs, drives, inside):
+        command.add_argument("--json", action="store_true")
         command.add_argument("--strict", action="store_true", help="exit status 1 if a phase fails")
     arguments = parser.parse_args(argv)
     try:

@@ -26,6 +26,8 @@ import emb_daemon
 from emb_daemon.calibration.files import dump_calibration
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.identify.example import FILES
+from emb_daemon.logs.mapping import Mapping
+from emb_daemon.offline import Log, load_log
 
 #: Step of the truth, s; every sampling rate is a whole part of it.
 FINE_S = 0.0005
@@ -127,12 +129,46 @@ def sampled(of: Truth, rate_Hz: float, means: bool = True) -> dict[str, np.ndarr
     }
 
 
+def columns_of(time_s: np.ndarray, **measured: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of what is measured at these times; what is not is zero, plates are at 22 degC."""
+    others = {"angle_rad": 0.0, "speed_rad_per_s": 0.0, "current_A": 0.0, "plate_C": 22.0, "force_N": 0.0}
+    return {"time_s": time_s} | {name: value + 0.0 * time_s for name, value in (others | measured).items()}
+
+
 def write_rig(folder: Path, mapping: str = MAPPING) -> Path:
     """DBC, mapping and calibration of the rig in ``folder``; returns the mapping's path."""
     (folder / "rig.dbc").write_text(DBC)
     (folder / "mapping.yaml").write_text(mapping)
     (folder / "calibration.yaml").write_text(_calibration_file())
     return folder / "mapping.yaml"
+
+
+def load_mapped(path: Path) -> Log:
+    """The log of a file through the mapping that lies beside it."""
+    return load_log(path, read=Mapping(path.parent / "mapping.yaml").read)
+
+
+def read(folder: Path, columns: dict[str, np.ndarray], mapping: str = COLUMNS) -> Log:
+    """The log of a table of columns."""
+    write_rig(folder, mapping)
+    return load_mapped(write_table(folder / "a.parquet", columns))
+
+
+#: Messages of the signals that `write_mapping` is given.
+_MESSAGES = {
+    "MotorAngle": "EMB_FL_Resolver", "MotorSpeed": "EMB_FL_Resolver", "CurrentQ": "EMB_FL_Current",
+    "InnerBackplateTemp": "EMB_FL_Thermocouple", "OuterBackplateTemp": "EMB_FL_Thermocouple",
+    "ClampForceRef": "RIG_FL_Force", "InnerPadTemp2mm": "RIG_FL_InnerPad",
+    "VehicleSpeed": "VEH_Status", "BrakeRequest": "VEH_Status", "ParkBrake": "VEH_Status", "AmbientTemp": "VEH_Status",
+    "WheelSpeedFL": "VEH_WheelSpeed",
+}  # fmt: skip
+
+
+def write_mapping(folder: Path, head: str, **signals: str) -> Mapping:
+    """A mapping with the line ``head``, and of each signal what stands in its braces."""
+    lines = [f"  {_MESSAGES[name]}.{name}: {{{mapped}}}" for name, mapped in signals.items()]
+    (folder / "mapping.yaml").write_text("\n".join(["format: 1", head, "signals:", *lines]) + "\n", encoding="utf-8")
+    return Mapping(folder / "mapping.yaml")
 
 
 @functools.cache

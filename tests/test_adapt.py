@@ -745,13 +745,6 @@ def test_an_old_curve_keeps_what_driving_said_of_a_drift(ideal):
             assert drift["log_odds"] == drift["least"] and drift["error"][CONTACT] == 0.0
 
 
-def test_a_torque_constant_that_no_magnet_has_is_rejected(ideal):
-    rows = trained_rows(ideal)
-    rows["current_q"] /= 0.6
-    found = fit(rows, IDEAL)
-    assert found.outcome == r.OUT_OF_BOUNDS and "torque constant" in found.note
-
-
 def test_an_offset_of_the_current_is_neither_friction_nor_contact(ideal):
     rows = trained_rows(ideal)
     rows["current_q"] += 1.5
@@ -840,19 +833,23 @@ def test_each_limit_of_the_evaluation_refuses(acceptable, limit, value, outcome,
     assert found.outcome == outcome and note in found.note
 
 
-@pytest.mark.parametrize("cycles", [-1, 1])
-def test_a_current_of_another_cycle_is_no_other_friction(ideal, cycles):
+@pytest.mark.parametrize(
+    ("gain", "cycles", "softer", "note"),
+    [
+        (0.6, 0, 1.0, "torque constant"),
+        (1.0, -1, 1.0, "presliding angle"),
+        (1.0, 1, 1.0, "presliding angle"),
+        (1.0, 0, 0.5, "travel"),
+    ],
+    ids=["no magnet's constant", "current of a later cycle", "of an earlier one", "pads softer than any that were calibrated"],
+)
+def test_what_no_brake_has_is_rejected(ideal, gain, cycles, softer, note):
     """Learned, friction that turns over within another angle cost 208 N where the delay was found and undone afterwards."""
-    rows = trained_rows(ideal)
-    rows["current_q"] = np.roll(rows["current_q"], cycles)
+    ideal["curve"] *= softer
+    rows = trained_rows(ideal, high_rad=20.0 if softer == 1.0 else 28.0)
+    rows["current_q"] = np.roll(rows["current_q"] / gain, cycles)
     found = fit(rows, IDEAL)
-    assert found.outcome == r.OUT_OF_BOUNDS and "presliding angle" in found.note
-
-
-def test_pads_softer_than_any_that_were_calibrated_are_rejected(ideal):
-    ideal["curve"] *= 0.5
-    found = fit(trained_rows(ideal, high_rad=28.0), IDEAL)
-    assert found.outcome == r.OUT_OF_BOUNDS and "travel" in found.note
+    assert found.outcome == r.OUT_OF_BOUNDS and note in found.note
 
 
 # --- Memory ------------------------------------------------------------------------------------------------------------

@@ -262,26 +262,23 @@ def test_it_is_moved_only_while_the_motor_stands(parameters):
     assert (a["delay"], a["delay_left"]) == (1.0, 0.0)
 
 
-@pytest.mark.parametrize(("found", "limit"), [(9.0, alignment.LATEST), (-9.0, -alignment.EARLIEST)])
-def test_no_shift_is_beyond_what_frames_and_gateways_make(found, limit):
+@pytest.mark.parametrize(
+    ("kind", "found", "limit"),
+    [
+        ("delay", 9.0, alignment.LATEST),
+        ("delay", -9.0, -alignment.EARLIEST),
+        ("lag", -20.0, -alignment.SLOWEST),
+        ("lag", 20.0, alignment.SLOWEST),
+    ],
+)
+def test_no_shift_is_beyond_what_frames_and_gateways_make_and_no_filter_slower_than_can_be_undone(kind, found, limit):
     a, m = np.zeros(1, ALIGNMENT)[0], np.zeros(1, SAMPLE)[0]
     m["dt"] = _DT
     for _ in range(8):
         align(a, m)
-    a["delay_left"] = found
+    a[f"{kind}_left"] = found
     align(a, m)
-    assert a["delay"] == limit
-
-
-@pytest.mark.parametrize("found", [-20.0, 20.0])
-def test_no_filter_is_slower_than_can_be_undone(found):
-    a, m = np.zeros(1, ALIGNMENT)[0], np.zeros(1, SAMPLE)[0]
-    m["dt"] = _DT
-    for _ in range(8):
-        align(a, m)
-    a["lag_left"] = found
-    align(a, m)
-    assert a["lag"] == np.copysign(alignment.SLOWEST, found) and a["lag_left"] == 0.0
+    assert a[kind] == limit and (kind == "delay" or a["lag_left"] == 0.0)
 
 
 @pytest.mark.parametrize("cycles", [-4.0, 2.0, 6.0])

@@ -182,8 +182,12 @@ def test_several_faults_of_effects_each_with_its_line(tmp_path):
         (r"(?m)^actuator:.*$", "actuator: ''", "length >= 1"),
         (r"(?m)^actuator:.*$", "actuator: 5", "Expected `str`"),
         (r"(?m)^    inner_heat_share:.*$", "    inner_heat_share: 0.99", "sum exceeds 1"),
+        (r"(?m)^  maximum_force_N:.*$", "  maximum_force_N: 8000.0\nadaptation:\n  high_force_N: 18000.0",
+         "adaptation.high_force_N: 18000 exceeds stiffness.maximum_force_N (8000)"),
+        (r"(?m)^actuator:.*$", "actuator: a\nadaptation: {minimum_ambient_C: 50.0}", "maximum_ambient_C: expected more than"),
+        (r"(?m)^pad_thickness_mm:.*$", "pad_thickness_mm: 77.0", "pad_thickness_mm: 77.0 is too far"),
     ],
-)
+)  # fmt: skip
 def test_shapes_and_relations(tmp_path, pattern, value, expected):
     text, count = re.subn(pattern, value, _TEXT, count=1)
     assert count == 1
@@ -361,22 +365,6 @@ def test_force_up_to_which_a_curve_rises(coefficients, force):
 def test_a_curve_that_falls_before_the_largest_force_is_refused(coefficients, expected):
     with pytest.raises(InvalidValue, match=expected):
         _stiffness(*coefficients)
-
-
-@pytest.mark.parametrize(
-    ("pattern", "value", "expected"),
-    [
-        (r"(?m)^  maximum_force_N:.*$", "  maximum_force_N: 8000.0\nadaptation:\n  high_force_N: 18000.0",
-         "adaptation.high_force_N: 18000 exceeds stiffness.maximum_force_N (8000)"),
-        (r"(?m)^actuator:.*$", "actuator: a\nadaptation: {minimum_ambient_C: 50.0}", "maximum_ambient_C: expected more than"),
-        (r"(?m)^pad_thickness_mm:.*$", "pad_thickness_mm: 77.0", "pad_thickness_mm: 77.0 is too far"),
-    ],
-)  # fmt: skip
-def test_contradicting_ranges_are_refused(tmp_path, pattern, value, expected):
-    text, count = re.subn(pattern, value, _TEXT, count=1)
-    assert count == 1
-    (fault,) = _faults(tmp_path, text)
-    assert expected in fault and re.match(r":\d+: ", fault)
 
 
 @pytest.mark.parametrize(("maximum_N", "training_N"), [(8000.0, 4800.0), (30000.0, 18000.0), (42000.0, 18000.0)])

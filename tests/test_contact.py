@@ -52,24 +52,18 @@ def test_contact_is_signalled_within_two_and_a_half_radians_on_the_rig(logs, nam
     assert not np.any(estimates["engaged"] & (past < -0.6))
 
 
-@pytest.mark.parametrize("speed", [1.0, 10.0, 60.0, 210.0])
-def test_contact_is_signalled_in_time_at_any_motor_speed(parameters, speed):
+@pytest.mark.parametrize(
+    ("speed", "to_rad", "unknown_rad", "earliest_rad"),
+    [*((speed, 12.0, None, -0.6) for speed in (1.0, 10.0, 60.0, 210.0)), (1.0, 6.0, 3.0, 0.0), (5.0, 6.0, 3.0, 0.0)],
+)
+def test_contact_is_signalled_in_time_at_any_motor_speed(parameters, speed, to_rad, unknown_rad, earliest_rad):
+    """Also with a power-on clearance unknown by three radians: at moderate speed the rise of torque is what tells."""
     p = brake.ideal(parameters)
-    rows, _ = brake.samples(p, brake.clamp(p, 12.0, (p["clearance"] + 12.0) / speed))
+    p["clearance_sigma"] = unknown_rad or p["clearance_sigma"]
+    rows, _ = brake.samples(p, brake.clamp(p, to_rad, (p["clearance"] + to_rad) / speed))
     estimates = estimate(brake.noisy(rows, p), p)
     signalled = rows["angle"][estimates["engaged"]].min() - p["clearance"]
-    assert -0.6 < signalled < 2.5
-
-
-@pytest.mark.parametrize("speed", [1.0, 5.0])
-def test_torque_alone_signals_contact_where_the_angle_says_nothing(parameters, speed):
-    """Power-on clearance unknown by three radians: at moderate speed the rise of torque is what tells."""
-    p = brake.ideal(parameters)
-    p["clearance_sigma"] = 3.0
-    rows, _ = brake.samples(p, brake.clamp(p, 6.0, (p["clearance"] + 6.0) / speed))
-    estimates = estimate(brake.noisy(rows, p), p)
-    signalled = rows["angle"][estimates["engaged"]].min() - p["clearance"]
-    assert 0.0 < signalled < 2.5
+    assert earliest_rad < signalled < 2.5
 
 
 def test_an_offset_of_the_current_is_no_contact(parameters):

@@ -243,17 +243,13 @@ class TestPacer:
         pacer.note_arrival(0, 1_000_000)
         assert 1_000_000 + CYCLE_NS < pacer.next_wake(1_000_001) < 1_000_000 + CYCLE_NS + 500_000
 
-    def test_samples_that_arrive_together_are_answered_together(self):
+    @pytest.mark.parametrize(("second_ns", "together"), [(1_100_000, True), (3_000_000, False)])
+    def test_samples_that_arrive_together_are_answered_together_and_no_others(self, second_ns, together):
         pacer = Pacer(1_000_000)
         pacer.note_arrival(0, 1_000_000)
-        pacer.note_arrival(1, 1_100_000)
-        assert pacer.next_wake(1_100_001) >= 1_100_000 + CYCLE_NS
-
-    def test_samples_that_arrive_apart_are_answered_apart(self):
-        pacer = Pacer(1_000_000)
-        pacer.note_arrival(0, 1_000_000)
-        pacer.note_arrival(1, 3_000_000)
-        assert pacer.next_wake(3_000_001) < 2_000_000 + CYCLE_NS
+        pacer.note_arrival(1, second_ns)
+        wake = pacer.next_wake(second_ns + 1)
+        assert wake >= second_ns + CYCLE_NS if together else wake < 2_000_000 + CYCLE_NS
 
     def test_a_lost_sample_does_not_stop_the_ticks(self):
         pacer = Pacer(0)

@@ -46,6 +46,13 @@ def test_what_is_generated_is_current(script):
     assert result.returncode == 0, result.stderr or f"docs/{script} has to be run again"
 
 
+def test_tests_that_pages_name_exist():
+    tests = "\n".join(path.read_text(encoding="utf-8") for path in _ROOT.glob("tests/**/*.py"))
+    named = {name for page in _PAGES for name in re.findall(r"\.py::(\w+)|`::(\w+)`", page.read_text(encoding="utf-8"))}
+    assert len(named) > 50
+    assert not {name for name in map("".join, named) if not re.search(rf"(def|class) {name}\b", tests)}
+
+
 @pytest.mark.parametrize("page", _PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
     for link in _LINK.findall(_prose(page)):

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow.feather
 import pyarrow.parquet
 import pytest
+from foreignkit import columns_of, load_mapped, read, write_mapping
 from scipy.io import savemat
 
 import emb_daemon
@@ -20,7 +21,7 @@ from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.resample import at_our_rate
 from emb_daemon.logs.write import write_frames
-from emb_daemon.offline import load_log
+from emb_daemon.offline import Log, load_log
 from emb_daemon.wire.contract import E2E_ERROR
 
 
@@ -29,11 +30,20 @@ def truth():
     return foreignkit.truth()
 
 
+@pytest.fixture
+def columns(truth):
+    return foreignkit.sampled(truth, 250.0)
+
+
 def _replay(folder, log, capsys, *options):
     arguments = ["replay", log, "--mapping", folder / "mapping.yaml", "--calibration", folder / "calibration.yaml", *options]
     assert main([*map(str, arguments), "--json"]) == 0
     said = capsys.readouterr()
     return json.loads(said.out)["logs"][0], said.err
+
+
+def _options(bus) -> list[str]:
+    return ["--mapping", str(bus.parent / "mapping.yaml"), "--calibration", str(bus.parent / "calibration.yaml")]
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +81,7 @@ def test_a_bus_of_other_people_is_replayed_and_says_what_it_lacks(bus, capsys):
     assert figures["force_N"]["fused"]["rmse"] < 40.0 and figures["force_N"]["inside_two_sigma"] > 0.93
     assert figures["temperature_K"] == {} and figures["invalid"] == 0.0
     assert "OuterBackplateTemp is not measured: it is taken to be the inner one's" in said
-    options = ["--mapping", str(bus.parent / "mapping.yaml"), "--calibration", str(bus.parent / "calibration.yaml")]
-    assert main(["replay", str(bus), *options]) == 0
+    assert main(["replay", str(bus), *_options(bus)]) == 0
     assert "of the samples" not in capsys.readouterr().out
 
 
@@ -118,43 +127,35 @@ def test_columns_and_channels_are_logs(truth, tmp_path, name):
     text = foreignkit.COLUMNS if not name.endswith("mf4") else foreignkit.COLUMNS.replace("time: {signal: time_s}\n", "")
     foreignkit.write_rig(tmp_path, text)
     columns = {key: values[:500] for key, values in foreignkit.sampled(truth, 250.0).items()}
-    samples = load_log(foreignkit.write_table(tmp_path / name, columns), read=Mapping(tmp_path / "mapping.yaml").read).samples
+    samples = load_mapped(foreignkit.write_table(tmp_path / name, columns)).samples
     assert len(samples) == 500 and np.abs(samples["angle"] - columns["angle_rad"]).max() < 1.1e-4
     start_s = foreignkit.START_S if name.endswith("mf4") else 0.0
     assert samples["time_ns"][0] * 1e-9 - start_s == pytest.approx(columns["time_s"][0], abs=1e-6)
 
 
-@pytest.mark.parametrize(("ending", "mark"), [("txt", " "), ("csv", ","), ("tsv", "\t"), ("dat", ";")])
-def test_a_table_without_header_has_its_columns_by_number(tmp_path, ending, mark):
-    """As microcontrollers print it: numbers alone, in a file called anything."""
-    mapping = foreignkit.COLUMNS
-    for number, name in enumerate(_HEADER.split(",")):
-        mapping = mapping.replace(name, f"column {number + 1}")
-    foreignkit.write_rig(tmp_path, mapping)
-    (tmp_path / f"a.{ending}").write_text(_table(100).replace(",", mark))
-    samples = load_log(tmp_path / f"a.{ending}", read=Mapping(tmp_path / "mapping.yaml").read).samples
-    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
+def _read_text(folder, text: str, mapping: str = foreignkit.COLUMNS, name: str = "a.csv") -> Log:
+    """The log of a table that is a text."""
+    foreignkit.write_rig(folder, mapping)
+    (folder / name).write_text(text, encoding="utf-8", newline="")
+    return load_mapped(folder / name)
 
 
 @pytest.mark.parametrize(
-    ("before", "after"), [("0.6\n", ""), ("0.6\ndata = [7 7 7 7 7 7\n", "];\n"), ("data = [7 7 7 7 7 7\n", "]")]
+    ("name", "mark", "before", "after"),
+    [
+        ("a.txt", " ", "", ""),
+        ("a.csv", ",", "", ""),
+        ("a.tsv", "\t", "", ""),
+        ("a.dat", ";", "", ""),
+        ("a.m", " ", "0.6\n", ""),
+        ("a.m", " ", "0.6\ndata = [7 7 7 7 7 7\n", "];\n"),
+        ("a.m", " ", "data = [7 7 7 7 7 7\n", "]"),
+    ],
 )
-def test_a_matrix_of_a_script_has_its_columns_by_number(tmp_path, before, after):
-    """As a program prints it for MATLAB, below a number of its own."""
-    mapping = foreignkit.COLUMNS
-    for number, name in enumerate(_HEADER.split(",")):
-        mapping = mapping.replace(name, f"column {number + 1}")
-    foreignkit.write_rig(tmp_path, mapping)
-    (tmp_path / "a.m").write_text(before + _table(100).replace(",", " ") + after)
-    samples = load_log(tmp_path / "a.m", read=Mapping(tmp_path / "mapping.yaml").read).samples
-    assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4)
-
-
-def test_a_table_may_have_decimal_commas(tmp_path):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    rows = "".join(f"{0.004 * n:.3f};{0.1 * n:.1f};25.0;1.5;22;0\n".replace(".", ",") for n in range(100))
-    (tmp_path / "a.csv").write_text("time_s;angle_rad;speed_rad_per_s;current_A;plate_C;force_N\n" + rows)
-    samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
+def test_a_table_without_header_has_its_columns_by_number(tmp_path, name, mark, before, after):
+    """As microcontrollers print it: numbers alone, in a file called anything; and as a program prints a matrix for MATLAB,
+    below a number of its own."""
+    samples = _read_text(tmp_path, before + _table(100).replace(",", mark) + after, _by_place(), name).samples
     assert np.allclose(samples["angle"], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
 
 
@@ -203,18 +204,17 @@ _PAIRS = _HEADER.replace(",", ",,") + ",\n"
         (f"{_HEADER}\ns,rad,rad/s,A,degC,g\n\n{_table(100)}", "force_N says g and is taken in N: which is right?"),
         (_OF_LINES + _table(100, "{t:.3f},1,{a:.1f},25.0,1.5,22,0"), ""),
         ((_HEADER + "\n" + _table(100)).replace(",", "\r,").replace("\n", "\r\n"), ""),
+        ((_HEADER + "\n" + _table(100)).replace(",", ";").replace(".", ","), ""),
     ],
     ids=[
         "comments", "units", "comma at the ends", "comma at the rows' ends", "comma at the header's end", "tabs", "cut off",
         "two headers", "segments", "words", "old Mac", "bars", "blanks", "pairs of time and value", "flags beside",
         "late decimal commas", "quotes after blanks", "a typesetter's minus", "more names than cells",
-        "units above an empty line", "names of several lines", "columns put side by side",
+        "units above an empty line", "names of several lines", "columns put side by side", "decimal commas",
     ],
 )  # fmt: skip
 def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, content, said):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    (tmp_path / "a.csv").write_text(content, encoding="utf-8", newline="")
-    samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    samples = _read_text(tmp_path, content).samples
     assert np.allclose(samples["angle"][:100], 0.1 * np.arange(100), atol=2e-4) and np.all(samples["current_q"][1:] == 1.5)
     told = capsys.readouterr().err
     assert said in told and any(word in told for word in ("left out", "header", "which is right")) == bool(said)
@@ -240,14 +240,13 @@ def test_tables_are_read_as_measurement_tools_write_them(tmp_path, capsys, conte
     ],
 )
 def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}"))
+    mapping = foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, unit: {unit}}}")
     rows = (
         stamp.format(s=10.0 + 0.004 * n, whole=10, ms=4 * n, ns=1_790_000_000_000_000_000 + 4_000_000 * n, part=part)
         for n, part in ((n, (800_000_000 + 4_000_000 * n) % 1_000_000_000) for n in range(100))
     )
     table = "".join(f"{time},{0.1 * n:.1f},25.0,1.5,22,0\n" for n, time in enumerate(rows))
-    (tmp_path / "a.csv").write_text(f"{_HEADER}\n{table}")
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    log = _read_text(tmp_path, f"{_HEADER}\n{table}", mapping)
     assert np.allclose(log.time_s, 0.004 * np.arange(100), atol=1e-6)
 
 
@@ -256,8 +255,6 @@ def test_times_are_read_as_tools_write_them(tmp_path, stamp, unit):
     [(";", ",", "."), (";", ",", " "), (";", ".", "'"), (",", ".", ","), (";", ",", "\u00a0")],
 )
 def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("{signal: time_s}", "{signal: time_s, unit: ms}"))
-
     def number(value: float) -> str:
         text = f"{value:,.1f}".translate(str.maketrans({",": group, ".": decimal}))
         return f'"{text}"' if delimiter == "," else text
@@ -266,8 +263,8 @@ def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
         delimiter.join(map(number, (4.0 * n, 0.1 * n, 25.0, 1.5, 22.0, 1500.0 + 10.0 * (n % 2) - 900.0 * (n % 3 == 0))))
         for n in range(400)
     ]
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER.replace(",", delimiter), *rows]) + "\n")
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    mapping = foreignkit.COLUMNS.replace("{signal: time_s}", "{signal: time_s, unit: ms}")
+    log = _read_text(tmp_path, "\n".join([_HEADER.replace(",", delimiter), *rows]) + "\n", mapping)
     assert np.allclose(log.time_s, 0.004 * np.arange(400), atol=1e-6)
     assert set(np.round(log.force_N).tolist()) == {600.0, 610.0, 1500.0, 1510.0}
 
@@ -275,20 +272,16 @@ def test_thousands_may_be_told_apart(tmp_path, delimiter, decimal, group):
 @pytest.mark.parametrize(("whole", "largest_N"), [(1, 20_399.0), (0, 19.399)], ids=["thousands", "decimals"])
 def test_a_point_beside_decimal_commas_parts_thousands(tmp_path, whole, largest_N):
     """As a spreadsheet of such a country shows whole newtons; nobody writes thousands that begin with a zero."""
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     rows = [
         f"{0.004 * n:.3f};{0.1 * n:.1f};25,0;1,5;22,0".replace(".", ",") + f";{whole + n % 20}.{n:03d}" for n in range(400)
     ]
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER.replace(",", ";"), *rows]) + "\n")
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    log = _read_text(tmp_path, "\n".join([_HEADER.replace(",", ";"), *rows]) + "\n")
     assert np.nanmax(log.force_N) == pytest.approx(largest_N, abs=0.2)
 
 
 def test_what_a_tool_says_of_an_instrument_out_of_range_is_no_value(tmp_path, capsys):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     rows = [f"{0.004 * n:.3f},{0.1 * n:.1f},25.0,1.5,22,{'OVER' if n % 10 < 3 else '100'}" for n in range(300)]
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER, *rows]) + "\n")
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    log = _read_text(tmp_path, "\n".join([_HEADER, *rows]) + "\n")
     assert "90 cells are no numbers, left out, the first of them 'OVER'" in capsys.readouterr().err
     assert np.nanmax(np.abs(log.force_N - 100.0)) < 1.0 and len(log.samples) == 300
 
@@ -296,23 +289,17 @@ def test_what_a_tool_says_of_an_instrument_out_of_range_is_no_value(tmp_path, ca
 def test_a_table_is_one_whatever_it_is_called(tmp_path, capsys):
     """A text called .log, its header behind a mark; a column that is missed is told by name, units in its name or not."""
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    rows = "".join(f"{0.004 * n:.3f},{0.1 * n:.1f},25.0,1.5,22,0\n" for n in range(100))
-    (tmp_path / "a.log").write_text(f"# bench 4\n#{_HEADER}\n{rows}")
-    mapping = Mapping(tmp_path / "mapping.yaml")
-    assert len(load_log(tmp_path / "a.log", read=mapping.read).samples) == 100
+    text, mapping = f"# bench 4\n#{_HEADER}\n{_table(100)}", Mapping(tmp_path / "mapping.yaml")
+    assert len(_read_text(tmp_path, text, name="a.log").samples) == 100
     named = ",".join(f"{name} [x]" for name in _HEADER.split(","))
-    (tmp_path / "b.csv").write_text(f"{named.replace('time_s [x]', 'time_s')}\n{rows}")
+    (tmp_path / "b.csv").write_text(f"{named.replace('time_s [x]', 'time_s')}\n{_table(100)}")
     with pytest.raises(InputError, match=r"no such column; the table has time_s, angle_rad \[x\], speed_rad_per_s \[x\]"):
         mapping.read(tmp_path / "b.csv")
-    (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("signal: time_s", "signal: '#time_s'"))
-    assert len(load_log(tmp_path / "a.log", read=Mapping(tmp_path / "mapping.yaml").read).samples) == 100
-    for binary, said in (
-        (b"PK\x03\x04", "not readable"),
-        (b"\x89HDF", "not readable"),
-        (b"a\rb\n", "not readable"),
-    ):
+    marked = foreignkit.COLUMNS.replace("signal: time_s", "signal: '#time_s'")
+    assert len(_read_text(tmp_path, text, marked, "a.log").samples) == 100
+    for binary in (b"PK\x03\x04", b"\x89HDF", b"a\rb\n"):
         (tmp_path / "c.csv").write_bytes(binary + bytes(100))
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match="not readable"):
             mapping.read(tmp_path / "c.csv")
 
 
@@ -324,7 +311,7 @@ def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
         head + "\n" + "".join(f"2026-11-22 08:15:{10 + 0.004 * n:06.3f},{0.1 * n:.1f},25.0,1.5,22,0\n" for n in range(100))
     )
     (tmp_path / "a.csv").write_bytes(content.encode(encoding))
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    log = load_mapped(tmp_path / "a.csv")
     assert np.allclose(log.time_s, 0.004 * np.arange(100), atol=1e-6)
     assert log.samples["inner_backplate"][50] == 22.0
 
@@ -341,16 +328,12 @@ def test_a_table_may_have_clock_times_and_old_letters(tmp_path, encoding):
 )
 def test_names_are_found_in_the_letters_of_their_country(tmp_path, capsys, letters, angle, force):
     """A testing machine's table: an empty line, names in the letters of its Windows, units, quoted numbers."""
-    (tmp_path / "mapping.yaml").write_text(
-        f"format: 1\ntime: {{signal: t}}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: {angle}, unit: rad}}\n"
-        f"  RIG_FL_Force.ClampForceRef: {{signal: {force}, unit: N}}\n",
-        encoding="utf-8",
-    )
+    signals = {"MotorAngle": f"signal: {angle}, unit: rad", "ClampForceRef": f"signal: {force}, unit: N"}
+    mapping = write_mapping(tmp_path, "time: {signal: t}", **signals)
     rows = "".join(f'"{0.02 * n:.4f}","{0.1 * n:.4f}","{2.0 * n:.4f}"\r\n' for n in range(100))
     content = f"\r\nt,{angle},{force}\r\n(s),(mm),(N)\r\n{rows}"
     (tmp_path / "a.csv").write_bytes(content.encode(letters))
-    mapping = Mapping(tmp_path / "mapping.yaml")
-    log = load_log(tmp_path / "a.csv", read=mapping.read)
+    log = load_mapped(tmp_path / "a.csv")
     assert abs(log.samples["angle"][-1] - 9.9) < 0.05 and np.nanmax(log.force_N) == pytest.approx(198.0, abs=1.0)
     # A name that is not there is told beside those that are, not beside the empty line's.
     (tmp_path / "b.csv").write_text("\r\nt,way,load\r\n(s),(mm),(N)\r\n" + rows)
@@ -361,16 +344,13 @@ def test_names_are_found_in_the_letters_of_their_country(tmp_path, capsys, lette
 
 def test_a_speed_that_is_another_motion_than_the_angle_is_left_out(tmp_path, capsys):
     """The stamps of a busy computer, beside which a drive's own speed would lose the angle's zero again and again."""
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     time_s = 0.004 * np.arange(2000)
-    columns = {"time_s": time_s, "angle_rad": 30.0 * (1.0 - np.cos(3.0 * time_s)), "current_A": np.sin(3.0 * time_s)}
-    columns |= {"plate_C": 22.0 + 0.0 * time_s, "force_N": 0.0 * time_s}
+    columns = columns_of(time_s, angle_rad=30.0 * (1.0 - np.cos(3.0 * time_s)), current_A=np.sin(3.0 * time_s))
     true = 90.0 * np.sin(3.0 * time_s)
-    for speed, share in ((true, 0.0), (-true, 0.9)):
-        table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"speed_rad_per_s": speed})
-        samples = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read).samples
+    for speed, is_said in ((true, False), (-true, True)):
+        samples = read(tmp_path, columns | {"speed_rad_per_s": speed}).samples
         assert np.abs(samples["speed"][1:-1] - true[1:-1]).max() < 0.2
-        assert ("another motion" in capsys.readouterr().err) == (share > 0.0)
+        assert ("another motion" in capsys.readouterr().err) == is_said
 
 
 @pytest.mark.parametrize("load", ["a brake's", "none"])
@@ -379,32 +359,23 @@ def test_a_few_late_stamps_cost_a_machine_that_clamps_nothing_no_speed(tmp_path,
     mapping = (
         foreignkit.COLUMNS if load == "a brake's" else foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}")
     )
-    foreignkit.write_rig(tmp_path, mapping)
     true_s = 0.004 * np.arange(3000)
-    still, speed = 0.0 * true_s, 200.0 * np.sin(2.0 * true_s)
+    speed = 200.0 * np.sin(2.0 * true_s)
     stamps = true_s.copy()
     for first in range(100, 3000, 150):
         stamps[first : first + 2] = true_s[first - 1 : first + 1]
-    columns = {"time_s": stamps, "angle_rad": 100.0 * (1.0 - np.cos(2.0 * true_s)), "speed_rad_per_s": speed}
-    columns |= {"current_A": still, "plate_C": 22.0 + still, "force_N": still}
-    table = foreignkit.write_table(tmp_path / "a.parquet", columns)
-    log = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read)
+    columns = columns_of(stamps, angle_rad=100.0 * (1.0 - np.cos(2.0 * true_s)), speed_rad_per_s=speed)
+    log = read(tmp_path, columns, mapping)
     off = np.abs(log.samples["speed"] - np.interp(log.time_s, true_s, speed))[5:-5].max()
     assert ("another motion" in capsys.readouterr().err, off > 50.0) == 2 * (load == "a brake's",)
 
 
 def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit(tmp_path, capsys):
     """A motor that swings at 20 Hz, sampled at 67: between two samples nobody knows the way."""
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     time_s = 0.015 * np.arange(2000)
-    still = 0.0 * time_s
-    columns = {"time_s": time_s, "angle_rad": 0.15 * np.sin(125.6 * time_s), "speed_rad_per_s": 18.84 * np.cos(125.6 * time_s)}
-    columns |= {"current_A": still, "plate_C": 22.0 + still, "force_N": still}
-    load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    motion = {"angle_rad": 0.15 * np.sin(125.6 * time_s), "speed_rad_per_s": 18.84 * np.cos(125.6 * time_s)}
+    read(tmp_path, columns_of(time_s, **motion))
     assert "times as fast" not in capsys.readouterr().err
-
-
-_HEAD = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n"
 
 
 @pytest.mark.parametrize(
@@ -417,15 +388,15 @@ _HEAD = "time_s,angle_rad,speed_rad_per_s,current_A,plate_C,force_N\n"
             ",".join(["time_s", *map("x{}".format, range(98)), "angle_deg"]) + "\n0" + 99 * ",0",
             "angle_rad: no such column; the table has angle_deg, ",
         ),
-        ("a.csv", _HEAD + "0,x,0,0,0,0\n", "expected a column of numbers"),
-        ("a.csv", _HEAD + ",1,0,0,0,0\n" * 9, "no value of angle_rad"),
+        ("a.csv", _HEADER + "\n0,x,0,0,0,0\n", "expected a column of numbers"),
+        ("a.csv", _HEADER + "\n" + ",1,0,0,0,0\n" * 9, "no value of angle_rad"),
         ("a.csv", "", "not readable"),
         (
             "a.csv",
-            _HEAD + "0,0,0,0,0,0\n" + "0,0,0,0\n" * 9,
+            _HEADER + "\n0,0,0,0,0,0\n" + "0,0,0,0\n" * 9,
             "9 of 10 rows have another number of cells than 6, the first of them 4",
         ),
-        ("a.csv", _HEAD + "0,,,0,0,0\n", "no value of angle_rad"),
+        ("a.csv", _HEADER + "\n0,,,0,0,0\n", "no value of angle_rad"),
         ("a.parquet", "no parquet", "not readable"),
         ("a.mf4", "no measurement", "not readable as a measurement"),
         ("a.blf", "", "expected a table"),
@@ -441,46 +412,42 @@ def test_a_faulty_table_is_refused_in_one_line(tmp_path, capsys, name, content, 
     assert line.startswith(f"{tmp_path / name}: ") and expected in line, line
 
 
-def test_a_table_without_times_is_read_at_the_rate_of_its_rows(tmp_path):
+def test_a_table_without_times_is_read_at_the_rate_of_its_rows(columns, tmp_path):
     """Its first column has no name, as a table that counts its rows has none."""
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     columns["time_s"] = columns["time_s"][0] + 0.004 * np.arange(len(columns["time_s"]))
     path, log = foreignkit.write_table(tmp_path / "a.csv", columns), {}
     for time in ("time: {rate_Hz: 250}", "time: {signal: column 1}"):
         path.write_text(path.read_text().replace('"time_s"', '""', 1))
         (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("time: {signal: time_s}", time))
-        log[time] = load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+        log[time] = load_mapped(path)
     counted, timed = log.values()
     assert np.array_equal(counted.samples["angle"], timed.samples["angle"])
     assert np.diff(counted.time_ns) == pytest.approx(np.diff(timed.time_ns), abs=1e3)
 
 
-def test_a_column_may_count_instead_of_telling_a_time(tmp_path):
+def test_a_column_may_count_instead_of_telling_a_time(columns, tmp_path):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
-    timed = load_log(foreignkit.write_table(tmp_path / "a.csv", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    timed = load_mapped(foreignkit.write_table(tmp_path / "a.csv", columns))
     counts = np.rint(8000.0 * columns["time_s"]).astype(np.int64)
     foreignkit.write_table(tmp_path / "b.csv", columns | {"time_s": counts})
     (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("signal: time_s", "signal: time_s, rate_Hz: 8000"))
-    counted = load_log(tmp_path / "b.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    counted = load_mapped(tmp_path / "b.csv")
     assert counted.time_ns == pytest.approx(timed.time_ns, abs=1e9 / 8000.0)
     _assert_same(counted.samples, timed.samples)
 
 
-def test_a_matrix_whose_rows_end_with_semicolons_is_a_table(tmp_path, capsys):
+def test_a_matrix_whose_rows_end_with_semicolons_is_a_table(columns, tmp_path, capsys):
     """As MATLAB and a motor drive's firmware write it: comments, a header and units behind %, rows of nan while nothing was
     measured yet."""
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    header, *rows = (
-        foreignkit.write_table(tmp_path / "a.csv", foreignkit.sampled(foreignkit.truth(), 250.0)).read_text().split()
-    )
-    plain = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    header, *rows = foreignkit.write_table(tmp_path / "a.csv", columns).read_text().split()
+    plain = load_mapped(tmp_path / "a.csv")
     capsys.readouterr()
     nothing = ",".join(["nan"] * len(header.split(",")))
     lines = ["%Measured on the bench, axis 0", "", "%" + header, "%[s],[rad]", f"{nothing};", *(f"{row};" for row in rows)]
     (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
-    log = load_log(tmp_path / "b.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    log = load_mapped(tmp_path / "b.csv")
     _assert_same(log.samples, plain.samples)
     assert capsys.readouterr().err == ""
 
@@ -494,12 +461,10 @@ def _written(path: Path, variables: dict) -> Path:
 
 
 @pytest.mark.parametrize("ending", [".mat", ".npz"])
-def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    plain = load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+def test_variables_of_matlab_and_numpy_are_columns(columns, tmp_path, ending):
+    plain = read(tmp_path, columns)
     path = _written(tmp_path / f"a{ending}", columns | {"rate": 250.0, "rig": "A", "plate_C": columns["plate_C"].astype(int)})
-    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+    _assert_same(load_mapped(path).samples, plain.samples)
     motion = np.column_stack([columns["angle_rad"], columns["speed_rad_per_s"]])
     rest = {name: values for name, values in columns.items() if name not in ("angle_rad", "speed_rad_per_s", "force_N")}
     mapping = foreignkit.COLUMNS.replace("angle_rad", "motion column 1").replace("speed_rad_per_s", "motion column 2")
@@ -510,7 +475,7 @@ def test_variables_of_matlab_and_numpy_are_columns(tmp_path, ending):
         cell = {"force_N": columns["force_N"]}
     (tmp_path / "mapping.yaml").write_text(mapping)
     path = _written(tmp_path / f"b{ending}", rest | cell | {"motion": motion.T})
-    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+    _assert_same(load_mapped(path).samples, plain.samples)
 
 
 def _matlab_with_references(path: Path, angle: np.ndarray, signals: list[np.ndarray], time: np.ndarray) -> None:
@@ -552,9 +517,9 @@ _TIMETABLE = _element(
 
 
 @pytest.mark.parametrize("version", [5, 7])
-def test_cells_and_structures_of_matlab_are_named_as_matlab_does(tmp_path, capsys, version):
+def test_cells_and_structures_of_matlab_are_named_as_matlab_does(columns, tmp_path, capsys, version):
     """Simulink's structure with time has an array of structures; a timetable only MATLAB reads, which is said of it."""
-    columns, path = foreignkit.sampled(foreignkit.truth(), 250.0), tmp_path / "a.mat"
+    path = tmp_path / "a.mat"
     signals = [columns["current_A"], columns["force_N"]]
     if version == 5:
         parts = np.zeros(2, [("values", object), ("label", object)])
@@ -565,19 +530,17 @@ def test_cells_and_structures_of_matlab_are_named_as_matlab_does(tmp_path, capsy
         path.write_bytes(path.read_bytes() + _TIMETABLE)
     else:
         _matlab_with_references(path, columns["angle_rad"], signals, columns["time_s"])
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: time}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: 'cells{1}', unit: rad}\n"
-        "  EMB_FL_Current.CurrentQ: {signal: out.signals(1).values, unit: A}\n"
-        "  RIG_FL_Force.ClampForceRef: {signal: out.signals(2).values, unit: N}\n"
-    )
-    log = load_log(path, read=Mapping(tmp_path / "m.yaml").read)
+    names = [f"signal: {name}, unit: " for name in ("'cells{1}'", "out.signals(1).values", "out.signals(2).values")]
+    mapped = {"MotorAngle": names[0] + "rad", "CurrentQ": names[1] + "A", "ClampForceRef": names[2] + "N"}
+    write_mapping(tmp_path, "time: {signal: time}", **mapped)
+    log = load_mapped(path)
     assert "tt is a timetable of MATLAB, which only MATLAB reads" in capsys.readouterr().err
     assert np.abs(log.samples["angle"] - columns["angle_rad"]).max() < 2e-4
     assert np.abs((log.samples["current_q"] - columns["current_A"])[1:]).max() < 0.02
     assert np.nanmax(np.abs(log.force_N - columns["force_N"])) < 0.1
-    (tmp_path / "m.yaml").write_text((tmp_path / "m.yaml").read_text().replace("(2)", "(3)"))
+    (tmp_path / "mapping.yaml").write_text((tmp_path / "mapping.yaml").read_text().replace("(2)", "(3)"))
     with pytest.raises(InputError, match=r"values: no such variable of numbers; it has .*out\.signals\(2\)\.values"):
-        Mapping(tmp_path / "m.yaml").read(path)
+        Mapping(tmp_path / "mapping.yaml").read(path)
 
 
 @pytest.mark.parametrize("by_place", [True, False])
@@ -590,14 +553,11 @@ def test_values_with_a_time_beside_each_go_by_that(tmp_path, capsys, by_place):
     rows = [[f"{values[row]:.6f}" if row < len(values) else "" for _, values in columns] for row in range(5000)]
     lines = [",".join(name for name, _ in columns), *map(",".join, rows)]
     (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
-    signals = ["column 2", "column 4", "column 6"] if by_place else ["Angle", "Current", "Force"]
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: column 1}\nsignals:\n"
-        f"  EMB_FL_Resolver.MotorAngle: {{signal: {signals[0]}, unit: rad}}\n"
-        f"  EMB_FL_Current.CurrentQ: {{signal: {signals[1]}, unit: A, mean_ms: 0}}\n"
-        f"  RIG_FL_Force.ClampForceRef: {{signal: {signals[2]}, unit: N}}\n"
-    )
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    names = ["column 2", "column 4", "column 6"] if by_place else ["Angle", "Current", "Force"]
+    angle_, current, force = (f"signal: {name}, unit: {unit}" for name, unit in zip(names, ("rad", "A", "N"), strict=True))
+    mapped = {"MotorAngle": angle_, "CurrentQ": current + ", mean_ms: 0", "ClampForceRef": force}
+    write_mapping(tmp_path, "time: {signal: column 1}", **mapped)
+    log = load_mapped(tmp_path / "a.csv")
     assert "each value goes by the last of them before it" in capsys.readouterr().err
     known = np.isfinite(log.force_N)
     assert known.mean() > 0.99 and log.samples["has_current"].mean() > 0.99
@@ -611,11 +571,9 @@ def test_of_a_recording_and_its_description_the_signals_are_offered(tmp_path):
     experiments[:] = [np.random.default_rng(n).normal(size=(300, 2)) for n in range(3)]
     described = {f"Current{n}": np.arange(3.0) for n in range(30)}
     savemat(tmp_path / "a.mat", {"data": {"InputData": experiments, **described}})
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {rate_Hz: 250}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: Current, unit: rad}\n"
-    )
+    mapping = write_mapping(tmp_path, "time: {rate_Hz: 250}", MotorAngle="signal: Current, unit: rad")
     with pytest.raises(InputError, match=r"it has (data\.InputData\{\d\} column \d(, )?){6}$"):
-        Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mat")
+        mapping.read(tmp_path / "a.mat")
 
 
 def test_numbers_and_texts_of_an_array_of_structures_are_columns(tmp_path):
@@ -623,25 +581,20 @@ def test_numbers_and_texts_of_an_array_of_structures_are_columns(tmp_path):
     rows["at"] = [f"2026-01-01T00:00:{0.004 * n:09.6f}" for n in range(200)]
     rows["angle"] = [math.sin(0.05 * n) for n in range(200)]
     savemat(tmp_path / "a.mat", {"s": rows})
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: s.at}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: s.angle, unit: rad}\n"
-    )
-    log = load_log(tmp_path / "a.mat", read=Mapping(tmp_path / "m.yaml").read)
+    write_mapping(tmp_path, "time: {signal: s.at}", MotorAngle="signal: s.angle, unit: rad")
+    log = load_mapped(tmp_path / "a.mat")
     assert log.time_s[-1] == pytest.approx(0.792, abs=0.005)
     assert log.samples["angle"][-100:] == pytest.approx(np.sin(0.05 * np.arange(99, 199)), abs=2e-4)
 
 
-def test_topics_of_several_senders_in_one_table_keep_their_own_times(tmp_path, capsys):
+def test_topics_of_several_senders_in_one_table_keep_their_own_times(columns, tmp_path, capsys):
     """Joined by their stamps, each in rows of its own: two of them within a fraction of a millisecond are no burst."""
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     rows = []
     for n, time_s in enumerate(columns["time_s"]):
         angle, speed, current, plate, force = (f"{columns[name][n]:.6g}" for name in _HEADER.split(",")[1:])
         rows += [f"{time_s:.6f},{angle},{speed},,,", f"{time_s + 3e-4:.6f},,,{current},,"]
         rows += [f"{time_s + 7e-4:.6f},,,,{plate},{force}"] * (n % 5 == 0)
-    (tmp_path / "a.csv").write_text("\n".join([_HEADER, *rows]) + "\n")
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    samples = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    samples = _read_text(tmp_path, "\n".join([_HEADER, *rows]) + "\n").samples
     assert "bunches" not in capsys.readouterr().err
     assert len(samples) == len(columns["time_s"])
     assert np.abs(samples["angle"] - columns["angle_rad"]).max() < 1e-3
@@ -716,11 +669,9 @@ def _as_file(path: Path, columns: dict[str, np.ndarray]) -> Path:
 
 
 @pytest.mark.parametrize("ending", [".xlsx", ".h5", ".mat", ".tdms", ".json", ".jsonl", ".ndjson", ".feather", ".npy"])
-def test_a_table_is_the_same_in_every_format(tmp_path, capsys, ending):
+def test_a_table_is_the_same_in_every_format(columns, tmp_path, capsys, ending):
     """The format goes by how the file begins where that tells it, not by its name."""
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    plain = load_log(foreignkit.write_table(tmp_path / "a.parquet", columns), read=Mapping(tmp_path / "mapping.yaml").read)
+    plain = read(tmp_path, columns)
     mapping = foreignkit.COLUMNS
     for place, name in enumerate(columns, 1):
         theirs = {".npy": f"column {place}", ".feather": name, ".xlsx": name}.get(ending, f"log.{name}")
@@ -729,7 +680,7 @@ def test_a_table_is_the_same_in_every_format(tmp_path, capsys, ending):
     path = _as_file(tmp_path / f"b{ending}", columns)
     if "json" not in ending:
         path = path.rename(tmp_path / "b.txt")
-    _assert_same(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples, plain.samples)
+    _assert_same(load_mapped(path).samples, plain.samples)
     assert ("its last line is cut off" in capsys.readouterr().err) == (ending == ".jsonl")
 
 
@@ -752,48 +703,42 @@ def _long(line: str) -> str:
     ids=["monitor", "database", "historian"],
 )
 def test_a_table_may_have_a_row_for_each_value(tmp_path, text, time):
-    (tmp_path / "m.yaml").write_text(
-        f"format: 1\ntime: {{{time}}}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: angle, unit: rad, scale: 20}}\n"
-    )
     (tmp_path / "a.txt").write_text(text)
-    found = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "a.txt"), "EMB_FL_Resolver")
+    mapping = write_mapping(tmp_path, f"time: {{{time}}}", MotorAngle="signal: angle, unit: rad, scale: 20")
+    found = Decoder().columns(mapping.read(tmp_path / "a.txt"), "EMB_FL_Resolver")
     seconds = 1e-9 * (found["time_ns"] - found["time_ns"][0])
     assert seconds[-1] == pytest.approx(239.76, abs=0.3)
     assert found["MotorAngle"] == pytest.approx(20.0 * np.sin(0.01 * seconds / 0.24), abs=0.1)
-    (tmp_path / "m.yaml").write_text((tmp_path / "m.yaml").read_text().replace("signal: angle", "signal: angel"))
+    misspelt = write_mapping(tmp_path, f"time: {{{time}}}", MotorAngle="signal: angel, unit: rad")
     with pytest.raises(InputError, match="angel: no row has this name; the table has angle, mode"):
-        Mapping(tmp_path / "m.yaml").read(tmp_path / "a.txt")
+        misspelt.read(tmp_path / "a.txt")
 
 
 def test_of_sheets_alike_the_one_that_is_read_is_named(tmp_path, capsys):
     pytest.importorskip("python_calamine", reason="NOT RUN: the formats extra is not installed")
     rows = [["t", "x"], *([0.004 * n, math.sin(0.1 * n)] for n in range(300))]
     _write_workbook(tmp_path / "a.xlsx", {"first": rows, "second": rows})
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: x, unit: rad}\n"
-    )
-    Mapping(tmp_path / "m.yaml").read(tmp_path / "a.xlsx")
+    write_mapping(tmp_path, "time: {signal: t}", MotorAngle="signal: x, unit: rad").read(tmp_path / "a.xlsx")
     assert "2 sheets have these columns (first, second); the first alone is read" in capsys.readouterr().err
 
 
-def test_a_time_may_be_a_duration_and_a_name_have_a_blank_that_breaks_no_line(tmp_path):
+def test_a_time_may_be_a_duration_and_a_name_have_a_blank_that_breaks_no_line(columns, tmp_path):
     mapping = foreignkit.COLUMNS.replace("signal: force_N", "signal: clamp force")
     # A duration has its unit, whatever the mapping says.
     foreignkit.write_rig(tmp_path, mapping.replace("{signal: time_s}", "{signal: time_s, unit: ms}"))
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     table = pyarrow.table(columns).set_column(
         0, "time_s", pyarrow.array(np.rint(1e6 * columns["time_s"]).astype(np.int64)).cast(pyarrow.duration("us"))
     )
     names = ["clamp\N{NO-BREAK SPACE}force" if name == "force_N" else name for name in table.column_names]
     pyarrow.parquet.write_table(table.rename_columns(names), tmp_path / "a.parquet")
-    log = load_log(tmp_path / "a.parquet", read=Mapping(tmp_path / "mapping.yaml").read)
+    log = load_mapped(tmp_path / "a.parquet")
     assert log.time_s == pytest.approx(columns["time_s"] - columns["time_s"][0], abs=1e-5)
     assert np.nanmax(log.force_N) == pytest.approx(np.max(columns["force_N"]), rel=1e-3)
 
 
 @pytest.mark.parametrize("ending", [".parquet", ".npz"])
-def test_dates_and_structures_are_read_as_libraries_keep_them(tmp_path, ending):
-    columns, path = foreignkit.sampled(foreignkit.truth(), 250.0), tmp_path / f"a{ending}"
+def test_dates_and_structures_are_read_as_libraries_keep_them(columns, tmp_path, ending):
+    path = tmp_path / f"a{ending}"
     at = np.datetime64("2026-01-01") + np.rint(1e9 * columns["time_s"]).astype("timedelta64[ns]")
     drive = pyarrow.StructArray.from_arrays([pyarrow.array(columns["angle_rad"])], ["angle"])
     foreignkit.write_rig(
@@ -803,35 +748,31 @@ def test_dates_and_structures_are_read_as_libraries_keep_them(tmp_path, ending):
         pyarrow.parquet.write_table(pyarrow.table(columns | {"time_s": at, "drive": drive}), path)
     else:
         np.savez(path, **(columns | {"time_s": at, "drive.angle": columns["angle_rad"]}))
-    log = load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+    log = load_mapped(path)
     assert log.time_s == pytest.approx(columns["time_s"] - columns["time_s"][0], abs=1e-5)
     assert np.abs(log.samples["angle"] - columns["angle_rad"]).max() < 2e-4
 
 
-def test_batches_of_several_lengths_are_one_recording(tmp_path):
+def test_batches_of_several_lengths_are_one_recording(columns, tmp_path):
     """Of a logger that empties its buffer now and then, and of a controller that goes through steps: part after part."""
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     plain, mapping = tmp_path / "plain.json", foreignkit.COLUMNS
     foreignkit.write_rig(tmp_path, mapping)
     plain.write_text(json.dumps({name: values.tolist() for name, values in columns.items()}))
-    whole = load_log(plain, read=Mapping(tmp_path / "mapping.yaml").read)
+    whole = load_mapped(plain)
     for name in columns:
         mapping = mapping.replace(f"signal: {name}", f"signal: steps.graph.{name}")
     (tmp_path / "mapping.yaml").write_text(mapping)
     parts = [{name: values[first:last].tolist() for name, values in columns.items()} for first, last in ((0, 90), (90, None))]
     steps = [{"name": "Finding", "graph": parts[0]}, {"name": "pause"}, {"name": "Clamping", "graph": parts[1]}]
     (tmp_path / "steps.json").write_text(json.dumps({"steps": steps}))
-    _assert_same(load_log(tmp_path / "steps.json", read=Mapping(tmp_path / "mapping.yaml").read).samples, whole.samples)
+    _assert_same(load_mapped(tmp_path / "steps.json").samples, whole.samples)
 
 
 def test_stamps_of_json_lines_may_be_dates(tmp_path):
     rows = [{"at": f"2026-03-01T12:00:{second:02d}.500+01:00", "plate": 20.0 + second} for second in range(60)]
     (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: at}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
-        "  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: plate, unit: degC}\n"
-    )
-    log = load_log(tmp_path / "a.jsonl", read=Mapping(tmp_path / "m.yaml").read)
+    write_mapping(tmp_path, "time: {signal: at}", MotorAngle="value: 0", InnerBackplateTemp="signal: plate, unit: degC")
+    log = load_mapped(tmp_path / "a.jsonl")
     assert log.time_ns[-1] - log.time_ns[0] == pytest.approx(59e9, abs=2e9)
     assert log.samples["inner_backplate"][-1] == pytest.approx(79.0, abs=1.1)
 
@@ -848,7 +789,7 @@ def test_nothing_that_a_numpy_file_holds_is_executed(tmp_path):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     path = _written(tmp_path / "a.npz", {"angle_rad": np.array([_Hostile(tmp_path / "executed")], object)})
     with pytest.raises(InputError, match=r"not readable: .*pickle"):
-        load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+        load_mapped(path)
     assert not (tmp_path / "executed").exists()
 
 
@@ -865,11 +806,11 @@ def test_a_channel_that_is_there_twice_is_told_by_its_group(tmp_path):
         ("angel", "angel: no such channel; the measurement has .*angle"),
         ("angle group 7", "angle group 7: no such channel"),
     ):
-        (tmp_path / "m.yaml").write_text(mapping.replace("angle,", f"{signal},"))
+        (tmp_path / "mapping.yaml").write_text(mapping.replace("angle,", f"{signal},"))
         with pytest.raises(InputError, match=said):
-            Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mf4")
-    (tmp_path / "m.yaml").write_text(mapping.replace("angle,", "angle group 1,"))
-    assert load_log(tmp_path / "a.mf4", read=Mapping(tmp_path / "m.yaml").read).samples["angle"][50] == pytest.approx(0.4)
+            Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.mf4")
+    (tmp_path / "mapping.yaml").write_text(mapping.replace("angle,", "angle group 1,"))
+    assert load_mapped(tmp_path / "a.mf4").samples["angle"][50] == pytest.approx(0.4)
 
 
 def test_a_channel_of_words_has_its_numbers_and_one_of_several_values_is_refused(tmp_path):
@@ -886,12 +827,12 @@ def test_a_channel_of_words_has_its_numbers_and_one_of_several_values_is_refused
         )
         file.save(tmp_path / "a.mf4")
     mapping = "format: 1\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: switch, unit: rad, scale: 5}\n"
-    (tmp_path / "m.yaml").write_text(mapping)
-    angle = load_log(tmp_path / "a.mf4", read=Mapping(tmp_path / "m.yaml").read).samples["angle"]
+    (tmp_path / "mapping.yaml").write_text(mapping)
+    angle = load_mapped(tmp_path / "a.mf4").samples["angle"]
     assert angle[[10, 90]].tolist() == pytest.approx([0.0, 5.0], abs=1e-3)
-    (tmp_path / "m.yaml").write_text(mapping.replace("switch", "pair"))
+    (tmp_path / "mapping.yaml").write_text(mapping.replace("switch", "pair"))
     with pytest.raises(InputError, match="pair: each of its samples has several values; expected a channel of one"):
-        Mapping(tmp_path / "m.yaml").read(tmp_path / "a.mf4")
+        Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.mf4")
 
 
 def test_estimates_of_another_actuator_are_said_to_be(bus, capsys):
@@ -902,8 +843,7 @@ def test_estimates_of_another_actuator_are_said_to_be(bus, capsys):
         assert (line in capsys.readouterr().err) == (not calibration)
 
 
-def test_variables_that_are_no_table_are_refused(tmp_path):
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
+def test_variables_that_are_no_table_are_refused(columns, tmp_path):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     for faulty, expected in (
         (columns | {"angle_rad": columns["angle_rad"][:-1]}, "variables of one length expected, found .*angle_rad 2998"),
@@ -911,7 +851,7 @@ def test_variables_that_are_no_table_are_refused(tmp_path):
     ):
         path = _written(tmp_path / "a.npz", faulty)
         with pytest.raises(InputError, match=expected):
-            load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+            load_mapped(path)
     for content, ending in (
         (b"no archive", ".npz"),
         (b"PK\x03\x04", ".npz"),
@@ -930,15 +870,12 @@ def test_variables_that_are_no_table_are_refused(tmp_path):
         path = tmp_path / f"b{ending}"
         path.write_bytes(content)
         with pytest.raises(InputError, match="not readable"):
-            load_log(path, read=Mapping(tmp_path / "mapping.yaml").read)
+            load_mapped(path)
 
 
-def test_columns_are_called_by_their_place_where_names_do_not_tell(tmp_path):
+def test_columns_are_called_by_their_place_where_names_do_not_tell(columns, tmp_path):
     """Two instruments in one table, each with its times, as an acquisition tool writes them; a first value that is none."""
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
-    table = foreignkit.write_table(tmp_path / "a.parquet", columns)
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    plain = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read)
+    plain = read(tmp_path, columns)
     names, values = list(columns), [*columns.values(), columns["time_s"]]
     rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
     tool = 'Timestamp,2020-03-16 17:04:51,Unit,"V"\nInterval,0.004\n'
@@ -946,18 +883,18 @@ def test_columns_are_called_by_their_place_where_names_do_not_tell(tmp_path):
     (tmp_path / "b.csv").write_text("\n".join([",".join(["nan"] * 5 + ["inf", "0", "nan"]), *(row + ",nan" for row in rows)]))
     for name, mapping in (
         ("a", foreignkit.COLUMNS.replace("signal: time_s", "signal: column 1")),
-        ("a", _by_place(names)),
-        ("b", _by_place(names)),
+        ("a", _by_place()),
+        ("b", _by_place()),
     ):
         (tmp_path / "mapping.yaml").write_text(mapping)
-        log = load_log(tmp_path / f"{name}.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+        log = load_mapped(tmp_path / f"{name}.csv")
         _assert_same(log.samples, plain.samples)
     (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS.replace("signal: time_s", "signal: column 8"))
     with pytest.raises(InputError, match="column 8: no such column; the table has time_s"):
-        load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+        load_mapped(tmp_path / "a.csv")
     (tmp_path / "mapping.yaml").write_text(foreignkit.COLUMNS)
     with pytest.raises(InputError, match="time_s: 2 such columns, of which `column N` is one by its place"):
-        load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+        load_mapped(tmp_path / "a.csv")
 
 
 def _assert_same(one: np.ndarray, other: np.ndarray) -> None:
@@ -965,9 +902,9 @@ def _assert_same(one: np.ndarray, other: np.ndarray) -> None:
         np.testing.assert_array_equal(one[name], other[name], name)
 
 
-def _by_place(names: list[str]) -> str:
+def _by_place() -> str:
     mapping = foreignkit.COLUMNS
-    for number, name in enumerate(names):
+    for number, name in enumerate(_HEADER.split(",")):
         mapping = mapping.replace(f"signal: {name}", f"signal: column {number + 1}")
     return mapping
 
@@ -982,16 +919,14 @@ def _by_place(names: list[str]) -> str:
         ("{cells},", ""),
     ],
 )
-def test_rows_with_more_cells_than_the_header_are_read(tmp_path, capsys, row, said):
+def test_rows_with_more_cells_than_the_header_are_read(columns, tmp_path, capsys, row, said):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    header, *rows = (
-        foreignkit.write_table(tmp_path / "a.csv", foreignkit.sampled(foreignkit.truth(), 250.0)).read_text().split()
-    )
-    plain = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    header, *rows = foreignkit.write_table(tmp_path / "a.csv", columns).read_text().split()
+    plain = load_mapped(tmp_path / "a.csv")
     capsys.readouterr()
     lines = [header, *(row.format(cells=cells, number=n + 1) for n, cells in enumerate(rows))]
     (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
-    log = load_log(tmp_path / "b.csv", read=Mapping(tmp_path / "mapping.yaml").read)
+    log = load_mapped(tmp_path / "b.csv")
     _assert_same(log.samples, plain.samples)
     assert capsys.readouterr().err == (f"{tmp_path / 'b.csv'}: {said}\n" if said else "")
 
@@ -1028,21 +963,17 @@ def test_what_a_mapping_lacks_is_said_once(tmp_path, before, after, expected):
     assert expected in line
 
 
-@pytest.mark.parametrize(("load", "missed"), [("{value: 0}", 1), ("{signal: force_N, unit: N}", 4)], ids=["none", "measured"])
+@pytest.mark.parametrize(("load", "missed"), [("value: 0", 1), ("signal: force_N, unit: N", 4)], ids=["none", "measured"])
 def test_of_a_machine_that_clamps_nothing_no_brakes_messages_are_missed(tmp_path, load, missed):
-    signals = "EMB_FL_Resolver.MotorAngle: {signal: angle_rad, unit: rad}", f"RIG_FL_Force.ClampForceRef: {load}"
-    text = "\n  ".join(["format: 1\ntime: {signal: time_s}\nsignals:", *signals])
-    (tmp_path / "mapping.yaml").write_text(text + "\n")
-    notes = [note for note in Mapping(tmp_path / "mapping.yaml").notes if "is not mapped" in note]
+    signals = {"MotorAngle": "signal: angle_rad, unit: rad", "ClampForceRef": load}
+    notes = [n for n in write_mapping(tmp_path, "time: {signal: time_s}", **signals).notes if "is not mapped" in n]
     assert len(notes) == missed and "EMB_FL_Current" in notes[0]
 
 
 @pytest.mark.parametrize(("unit", "newton"), [("kgf", 9.80665), ("kg", 9.80665), ("lbf", 4.448222), ("daN", 10.0)])
-def test_a_load_cell_may_speak_of_the_mass_that_weighs_so_much(tmp_path, unit, newton):
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("force_N, unit: N", f"force_N, unit: {unit}"))
-    columns = foreignkit.sampled(foreignkit.truth(), 250.0)
-    table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"force_N": columns["force_N"] / newton})
-    force = load_log(table, read=Mapping(tmp_path / "mapping.yaml").read).force_N
+def test_a_load_cell_may_speak_of_the_mass_that_weighs_so_much(columns, tmp_path, unit, newton):
+    mapping = foreignkit.COLUMNS.replace("force_N, unit: N", f"force_N, unit: {unit}")
+    force = read(tmp_path, columns | {"force_N": columns["force_N"] / newton}, mapping).force_N
     assert np.nanmax(force) == pytest.approx(np.nanmax(columns["force_N"]), rel=1e-3)
 
 
@@ -1060,10 +991,10 @@ def _without(text: str, *words: str) -> str:
         ("WheelSpeed", "VEH_WheelSpeed is not mapped: the disc may be turning", {"wheel speed lost"}, 120.0),
     ],
 )
-def test_what_is_missing_is_said_and_the_rest_goes_on(truth, tmp_path, capsys, left_out, said, reasons, most_N):
+def test_what_is_missing_is_said_and_the_rest_goes_on(columns, tmp_path, capsys, left_out, said, reasons, most_N):
     """As far as the physics allows, and with a sigma that holds."""
     foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, left_out))
-    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(truth, 250.0))
+    table = foreignkit.write_table(tmp_path / "stops.parquet", columns)
     figures, notes = _replay(tmp_path, table, capsys)
     assert said in notes
     assert {word for word, share in figures["reasons"].items() if share > 0.9} == reasons
@@ -1099,9 +1030,9 @@ def test_neither_status_nor_current_is_said(tmp_path, capsys):
     assert "the force stays unknown; of a bench say so by `value: 0`" in capsys.readouterr().err
 
 
-def test_a_rig_without_reference_is_judged_by_nothing(truth, tmp_path, capsys):
+def test_a_rig_without_reference_is_judged_by_nothing(columns, tmp_path, capsys):
     foreignkit.write_rig(tmp_path, _without(foreignkit.COLUMNS, "RIG_"))
-    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(truth, 250.0))
+    table = foreignkit.write_table(tmp_path / "stops.parquet", columns)
     out = tmp_path / "out.parquet"
     figures, _ = _replay(tmp_path, table, capsys, "--output", out)
     assert figures["force_N"] == {} and figures["temperature_K"] == {}
@@ -1129,7 +1060,7 @@ def test_an_angle_that_starts_anew_each_turn_is_put_together(truth, tmp_path):
         foreignkit.write_rig(tmp_path, foreignkit.COLUMNS.replace("angle_rad, unit: rad", mapped))
         table = columns | {"angle_rad": degrees % period if period else degrees}
         path = foreignkit.write_table(tmp_path / f"{name}.parquet", table)
-        samples.append(load_log(path, read=Mapping(tmp_path / "mapping.yaml").read).samples["angle"])
+        samples.append(load_mapped(path).samples["angle"])
     assert np.ptp(samples[0]) > 4.0 * np.pi and np.allclose(np.diff(samples[0]), np.diff(samples[1]), atol=4e-4)
 
 
@@ -1168,8 +1099,7 @@ def test_arrays_are_a_log(truth):
         emb_daemon.log_of_arrays(time_s, current_A=motion[2])
 
 
-def test_stamps_of_arrays_are_put_right_as_a_files(truth, capsys):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_stamps_of_arrays_are_put_right_as_a_files(columns, capsys):
     time_s, angle_rad = columns["time_s"], columns["angle_rad"]
     right = emb_daemon.log_of_arrays(time_s, angle_rad).samples
     assert capsys.readouterr().err == ""
@@ -1254,34 +1184,30 @@ def test_the_delays_of_a_busy_machine_are_no_other_rate(rig):
 
 def test_a_bench_without_a_motor_is_a_log_of_what_it_measured(tmp_path, capsys, recwarn):
     """A heated rod, one value every two seconds: temperatures arrive, and nothing is said of a motor."""
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
-        "  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: near, unit: degC}\n"
-        "  EMB_FL_Thermocouple.OuterBackplateTemp: {signal: far, unit: degC}\n"
-        "  RIG_FL_InnerPad.InnerPadTemp2mm: {signal: middle, unit: degC}\n"
-    )
+    foreignkit.write_rig(tmp_path)
+    plates = {"InnerBackplateTemp": "signal: near, unit: degC", "OuterBackplateTemp": "signal: far, unit: degC"}
+    head, mapped = "time: {signal: t}", plates | {"MotorAngle": "value: 0", "InnerPadTemp2mm": "signal: middle, unit: degC"}
+    mapping = write_mapping(tmp_path, head, **mapped)
     rows = "".join(f"{2 * n},{20 + 0.1 * n:.1f},{20 + 0.01 * n:.2f},{20 + 0.05 * n:.2f}\n" for n in range(300))
     (tmp_path / "rod.csv").write_text("t,near,far,middle\n" + rows)
-    log = load_log(tmp_path / "rod.csv", read=Mapping(tmp_path / "m.yaml").read)
+    log = load_mapped(tmp_path / "rod.csv")
     assert capsys.readouterr().err == "" and log.time_s[-1] - log.time_s[0] == pytest.approx(598.0, abs=1.01)
     samples = log.samples
     assert not samples["angle"].any() and np.all(np.diff(samples["time_ns"]) == 1_000_000_000)
     # Nothing was measured oftener, so that a week of it stays small.
-    frames = Mapping(tmp_path / "m.yaml").read(tmp_path / "rod.csv")
+    frames = mapping.read(tmp_path / "rod.csv")
     assert len(frames) <= len(np.unique(frames["can_id"])) * (len(samples) + 1)
     half = len(samples) // 2
     assert samples["inner_backplate"][half] == pytest.approx(35.0, abs=0.2)
     assert samples["outer_backplate"][half] == pytest.approx(21.5, abs=0.1)
     times, pads = log.reference.pads["inner"]
     assert pads[0][len(times) // 2] == pytest.approx(27.5, abs=0.2)
-    foreignkit.write_rig(tmp_path)
-    arguments = ["diagnose", "rod.csv", "--mapping", "m.yaml", "--calibration", "calibration.yaml", "--output", "found"]
+    arguments = ["diagnose", "rod.csv", "--mapping", "mapping.yaml", "--calibration", "calibration.yaml", "--output", "found"]
     assert main([word if "." not in word and word != "found" else str(tmp_path / word) for word in arguments]) == 2
     assert "neither a clamp force reference nor motor current to judge by" in capsys.readouterr().err.splitlines()[-1]
     assert not [str(found.message) for found in recwarn if issubclass(found.category, RuntimeWarning)]
-    text = (tmp_path / "m.yaml").read_text() + "  RIG_FL_Force.ClampForceRef: {signal: near, unit: N}\n"
-    (tmp_path / "m.yaml").write_text(text)
-    fine = load_log(tmp_path / "rod.csv", read=Mapping(tmp_path / "m.yaml").read)
+    lines = [line for line in mapping.notes if "Resolver" in line]
+    assert lines == [f"{tmp_path / 'mapping.yaml'}: EMB_FL_Resolver is constant: the motor stands throughout"]
+    write_mapping(tmp_path, head, ClampForceRef="signal: near, unit: N", **mapped)
+    fine = load_mapped(tmp_path / "rod.csv")
     assert np.all(np.diff(fine.samples["time_ns"]) == 4_000_000), "a force may be fast"
-    lines = [line for line in Mapping(tmp_path / "m.yaml").notes if "Resolver" in line]
-    assert lines == [f"{tmp_path / 'm.yaml'}: EMB_FL_Resolver is constant: the motor stands throughout"]

@@ -16,7 +16,6 @@ from emb_daemon.cli.main import main
 from emb_daemon.identify import validation
 from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps import attribution, noise, stiffness
-from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.write import write_frames
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
@@ -46,6 +45,27 @@ def _long() -> np.ndarray:
     return foreignkit.slow(seconds=80.0)
 
 
+def _identify(folder, campaign) -> int:
+    """The status with which `identify` ends, and found.yaml."""
+    arguments = ["identify", campaign, "--mapping", folder / "mapping.yaml", "--output", folder / "found.yaml"]
+    return main([str(argument) for argument in arguments])
+
+
+def _map_angle_and_force_alone(folder) -> None:
+    mapping = folder / "mapping.yaml"
+    lines = mapping.read_text().splitlines(keepends=True)
+    mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
+
+
+def _judge(folder, most_N: float, angle=None, first: int = 1) -> None:
+    """On a log of another motion the error of found.yaml is no larger, and no larger than it says."""
+    columns = foreignkit.sampled(foreignkit.truth(angle), 500.0)
+    log = foreignkit.load_mapped(foreignkit.write_table(folder / "judge.parquet", columns))
+    estimates = emb_daemon.run(log, load_calibration(folder / "found.yaml"))
+    error = (estimates["force"] - log.force_N)[first:]
+    assert np.sqrt(np.mean(error**2)) < most_N and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][first:]) > 0.9
+
+
 @pytest.mark.parametrize(
     ("motions", "said", "most_N", "status"),
     [
@@ -61,32 +81,19 @@ def _long() -> np.ndarray:
 )
 def test_a_calibration_is_no_worse_than_it_says(tmp_path, capsys, motions, said, most_N, status):
     campaign = foreignkit.write_campaign(tmp_path, **{name: motion() for name, motion in motions.items()})
-    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
-    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == status
+    assert _identify(tmp_path, campaign) == status
     assert said in capsys.readouterr().err
-    found = load_calibration(output)
-    for name, angle in (("stops", None), ("random_2", foreignkit.random(seed=2))):
-        table = foreignkit.write_table(tmp_path / f"{name}.parquet", foreignkit.sampled(foreignkit.truth(angle), 500.0))
-        log = emb_daemon.load_log(table, read=Mapping(mapping).read)
-        estimates = emb_daemon.run(log, found)
-        error = (estimates["force"] - log.force_N)[1:]
-        inside = np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:])
-        assert np.sqrt(np.mean(error**2)) < most_N and inside > 0.9, name
+    for angle in (None, foreignkit.random(seed=2)):
+        _judge(tmp_path, most_N, angle)
 
 
 def test_angle_and_force_alone_give_the_curve(tmp_path, capsys):
     campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow())
-    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
-    lines = mapping.read_text().splitlines(keepends=True)
-    mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
-    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == 3
+    _map_angle_and_force_alone(tmp_path)
+    assert _identify(tmp_path, campaign) == 3
     assert "torque: no log holds motor current" in capsys.readouterr().err
-    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(foreignkit.truth(), 500.0))
-    log = emb_daemon.load_log(table, read=Mapping(mapping).read)
-    estimates = emb_daemon.run(log, load_calibration(output))
-    error = (estimates["force"] - log.force_N)[100:]
     # Without a random log the relaxation is the usual one; sigma holds it.
-    assert np.sqrt(np.mean(error**2)) < 400.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][100:]) > 0.9
+    _judge(tmp_path, 400.0, first=100)
 
 
 def _overconfident(monkeypatch):
@@ -106,13 +113,11 @@ def test_sigma_covers_a_force_that_collapses_and_rises_again(tmp_path, capsys, m
     force before it, although a relative error of no force is nothing."""
     campaign = foreignkit.write_campaign(tmp_path, curve=_low())
     _dome(tmp_path, "curve.parquet")
-    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
     fit, fits = stiffness.identify, []
     monkeypatch.setattr(stiffness, "identify", lambda *of: (fits or fits.append(fit(*of)) or fits)[0])
-    main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
+    _identify(tmp_path, campaign)
     assert "worse than it says" not in capsys.readouterr().err
-    log = emb_daemon.load_log(tmp_path / "curve.parquet", read=Mapping(mapping).read)
-    found = load_calibration(output)
+    log, found = foreignkit.load_mapped(tmp_path / "curve.parquet"), load_calibration(tmp_path / "found.yaml")
     estimates = emb_daemon.run(log, found)
     error = (estimates["force"] - log.force_N)[1:]
     assert (
@@ -121,7 +126,7 @@ def test_sigma_covers_a_force_that_collapses_and_rises_again(tmp_path, capsys, m
         and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.9
     )
     _overconfident(monkeypatch)
-    main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
+    _identify(tmp_path, campaign)
     assert "curve.parquet, which was fitted: " in (told := capsys.readouterr().err) and "worse than it says" in told
 
 
@@ -134,17 +139,14 @@ def _dome(tmp_path, *names: str) -> None:
     columns = {"time_s": time_s, "angle_rad": angle, "force_N": force, "plate_C": 22.0 + 0.0 * time_s}
     for name in names:
         foreignkit.write_table(tmp_path / name, columns)
-    mapping = tmp_path / "mapping.yaml"
-    lines = mapping.read_text().splitlines(keepends=True)
-    mapping.write_text("".join(line for line in lines if "EMB_FL_Current" not in line and "MotorSpeed" not in line))
+    _map_angle_and_force_alone(tmp_path)
 
 
 def test_a_curve_that_predicts_worse_than_a_plain_cubic_is_reported(tmp_path, capsys):
     """Each of two logs is predicted from the other; the force of a dome is predicted much worse than by a cubic."""
     campaign = foreignkit.write_campaign(tmp_path, curve_1=_low(), curve_2=_low())
     _dome(tmp_path, "curve_1.parquet", "curve_2.parquet")
-    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
-    main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)])
+    _identify(tmp_path, campaign)
     said = "curves: a cubic of the angle for each way, fitted to the other slow logs, leaves "
     line = next(line for line in capsys.readouterr().err.splitlines() if line.startswith(said))
     cubic_N, ours_N = (float(number) for number in re.findall(r"([\d.e+]+) N\b", line))
@@ -172,26 +174,25 @@ def test_a_plain_cubic_is_fitted_to_the_logs_that_it_is_not_judged_on():
     assert left[1] == pytest.approx(np.sqrt((300.0**2 + 2.0 * 150.0**2) / 3.0), rel=0.05)
 
 
-def test_an_angle_of_the_wrong_sign_is_named(tmp_path, capsys):
-    campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow(seconds=8.0))
-    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=8.0)), 500.0)
-    turned = {"angle_rad": -columns["angle_rad"], "speed_rad_per_s": -columns["speed_rad_per_s"]}
-    foreignkit.write_table(tmp_path / "curve.parquet", columns | turned)
-    mapping = str(tmp_path / "mapping.yaml")
-    assert main(["identify", str(campaign), "--mapping", mapping, "--output", str(tmp_path / "c.yaml")]) == 2
-    assert "turn the angle round (`scale: -1`" in capsys.readouterr().err
-
-
-def test_an_angle_behind_a_gear_is_named_with_its_ratio(tmp_path, capsys):
-    """Its clearance is so small that the log seems not to begin released; the message states the ratio as the cause."""
-    motion = foreignkit.random(seconds=4.0)
-    campaign = foreignkit.write_campaign(tmp_path, random=motion)
-    columns = foreignkit.sampled(foreignkit.truth(motion), 500.0)
-    behind = {name: columns[name] / 20.0 for name in ("angle_rad", "speed_rad_per_s")}
-    foreignkit.write_table(tmp_path / "random.parquet", columns | behind)
-    mapping = str(tmp_path / "mapping.yaml")
-    assert main(["identify", str(campaign), "--mapping", mapping, "--output", str(tmp_path / "c.yaml")]) == 2
-    assert "is the angle that of a gear's output, or in another unit (`scale:" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("name", "motion", "seconds", "factor", "said"),
+    [
+        ("curve", foreignkit.slow, 8.0, -1.0, "turn the angle round (`scale: -1`"),
+        ("random", foreignkit.random, 4.0, 0.05, "is the angle that of a gear's output, or in another unit (`scale:"),
+    ],
+    ids=["turned round", "behind a gear"],
+)
+def test_an_angle_of_the_wrong_sign_or_ratio_is_named(tmp_path, capsys, name, motion, seconds, factor, said):
+    """Behind a gear its clearance is so small that the log seems not to begin released; the message states the ratio."""
+    angle = motion(seconds=seconds)
+    campaign, columns = (
+        foreignkit.write_campaign(tmp_path, **{name: angle}),
+        foreignkit.sampled(foreignkit.truth(angle), 500.0),
+    )
+    wrong = {column: factor * columns[column] for column in ("angle_rad", "speed_rad_per_s")}
+    foreignkit.write_table(tmp_path / f"{name}.parquet", columns | wrong)
+    assert _identify(tmp_path, campaign) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_a_misspelt_log_is_an_error(tmp_path, capsys):
@@ -253,17 +254,11 @@ def test_a_slow_clamp_may_be_sampled_slowly(tmp_path, capsys, rate_Hz):
     campaign = foreignkit.write_campaign(tmp_path, curve=foreignkit.slow(), random=foreignkit.random())
     for name, angle in (("curve", foreignkit.slow()), ("random", foreignkit.random())):
         foreignkit.write_table(tmp_path / f"{name}.parquet", foreignkit.sampled(foreignkit.truth(angle), rate_Hz))
-    mapping, output = tmp_path / "mapping.yaml", tmp_path / "found.yaml"
-    assert main(["identify", str(campaign), "--mapping", str(mapping), "--output", str(output)]) == 3
+    assert _identify(tmp_path, campaign) == 3
     told = capsys.readouterr().err
     assert f"one every {1e3 / rate_Hz:.0f} ms, and the way between two is unknown; expected 100 Hz or a slower motion" in told
     assert "curves: no usable log" not in told
-    found = load_calibration(output)
-    table = foreignkit.write_table(tmp_path / "stops.parquet", foreignkit.sampled(foreignkit.truth(), 500.0))
-    log = emb_daemon.load_log(table, read=Mapping(mapping).read)
-    estimates = emb_daemon.run(log, found)
-    error = (estimates["force"] - log.force_N)[1:]
-    assert np.sqrt(np.mean(error**2)) < 400.0 and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.9
+    _judge(tmp_path, 400.0)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import cantools
 import numpy as np
 import pyarrow.parquet
 import pytest
+from foreignkit import load_mapped, write_mapping
 
 from emb_daemon.cli.main import main
 from emb_daemon.errors import InputError, InputErrors
@@ -51,6 +52,11 @@ signals:
 """
 
 
+def _write_rig(folder, mapping: str = _MAPPING) -> None:
+    (folder / "their.dbc").write_text(_THEIR_DBC)
+    (folder / "mapping.yaml").write_text(mapping)
+
+
 @pytest.fixture(scope="module")
 def log(rig):
     return rig / "static" / "sine_5Hz.log.gz"
@@ -59,8 +65,7 @@ def log(rig):
 @pytest.fixture
 def foreign(log, tmp_path):
     """The rig's log of another rig: extended id, big-endian, other units, a reversed current, dots in its name, no E2E."""
-    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
-    (tmp_path / "mapping.yaml").write_text(_MAPPING)
+    _write_rig(tmp_path)
     theirs = cantools.database.load_file(tmp_path / "their.dbc")
     ours = load_log(log)
     frames = []
@@ -86,7 +91,7 @@ def foreign(log, tmp_path):
 
 def test_another_rigs_log_gives_the_same_samples(foreign, log, tmp_path):
     ours = load_log(log)
-    theirs = load_log(foreign, read=Mapping(tmp_path / "mapping.yaml").read)
+    theirs = load_mapped(foreign)
     assert abs(len(theirs.samples) - len(ours.samples)) <= 1
     count = min(len(theirs.samples), len(ours.samples))
     assert np.abs(theirs.samples["angle"] - ours.samples["angle"])[:count].max() < 3e-4
@@ -113,7 +118,7 @@ def test_another_rigs_log_is_judged_like_ours(foreign, log, tmp_path, capsys):
 
 
 def test_a_reference_that_is_not_mapped_is_absent_and_not_zero(foreign, tmp_path, capsys):
-    log = load_log(foreign, read=Mapping(tmp_path / "mapping.yaml").read)
+    log = load_mapped(foreign)
     assert np.isfinite(log.reference.clamp_force_N).all() and len(log.reference.clamp_force_N) > 1000
     assert np.isnan(log.reference.disc_C).all() and np.isnan(log.reference.brake_torque_Nm).all()
     table = tmp_path / "out.parquet"
@@ -127,15 +132,14 @@ def test_a_reference_that_is_not_mapped_is_absent_and_not_zero(foreign, tmp_path
 @pytest.mark.parametrize("period_ms", [1.0, 3.0, 10.0])
 def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
     """A steady 20 rad/s ramp sampled at another rate is the same ramp at 250 Hz."""
-    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
-    (tmp_path / "mapping.yaml").write_text(_MAPPING)
+    _write_rig(tmp_path)
     message = cantools.database.load_file(tmp_path / "their.dbc").get_message_by_name("Actuator")
     with can.BLFWriter(tmp_path / "ramp.blf") as writer:
         for number in range(int(2000 / period_ms)):
             time_s = 1e-3 * period_ms * number
             data = message.encode({"Position": math.degrees(20.0 * time_s), "Speed": 20.0 * 30.0 / math.pi})
             writer(can.Message(1_790_000_000 + time_s, message.frame_id, True, data=data, channel=1))
-    samples = load_log(tmp_path / "ramp.blf", read=Mapping(tmp_path / "mapping.yaml").read).samples
+    samples = load_mapped(tmp_path / "ramp.blf").samples
     assert 490 <= len(samples) <= 500 and np.all(samples["dt"][1:] == 0.004)
     assert np.abs(np.diff(samples["angle"]) - 0.08).max() < 6e-4
 
@@ -167,17 +171,15 @@ def test_other_sampling_rates_are_brought_to_ours(tmp_path, period_ms):
     ],
 )
 def test_a_faulty_mapping_is_refused_with_its_key(tmp_path, old, new, expected):
-    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
     assert old in _MAPPING
-    (tmp_path / "mapping.yaml").write_text(_MAPPING.replace(old, new))
+    _write_rig(tmp_path, _MAPPING.replace(old, new))
     with pytest.raises((InputError, InputErrors), match=None) as caught:
         Mapping(tmp_path / "mapping.yaml")
     assert expected in str(caught.value)
 
 
 def test_a_log_without_the_mapped_frames_is_named(log, tmp_path):
-    (tmp_path / "their.dbc").write_text(_THEIR_DBC)
-    (tmp_path / "mapping.yaml").write_text(_MAPPING)
+    _write_rig(tmp_path)
     with pytest.raises(InputError, match=r"no value of Actuator\.Position"):
         Mapping(tmp_path / "mapping.yaml").read(log)
 
@@ -259,10 +261,10 @@ def test_a_multiplexer_of_an_unknown_number_is_no_value(tmp_path):
         'VERSION ""\nBU_: T\nBO_ 256 M: 8 T\n SG_ Which M : 0|8@1+ (1,0) [0|0] "" T\n'
         ' SG_ Angle m1 : 8|16@1+ (0.01,0) [0|0] "rad" T\n'
     )
-    (tmp_path / "m.yaml").write_text("format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: M.Angle}\n")
+    mapping = write_mapping(tmp_path, "dbc: x.dbc", MotorAngle="signal: M.Angle")
     lines = [f"({0.002 * tick:.6f}) can0 100#{1 + tick % 2:02X}{'D007' if tick % 2 == 0 else 'FFFF'}" for tick in range(200)]
     (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
-    angle = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log"), "EMB_FL_Resolver")["MotorAngle"]
+    angle = Decoder().columns(mapping.read(tmp_path / "x.log"), "EMB_FL_Resolver")["MotorAngle"]
     assert len(angle) > 90 and angle == pytest.approx(20.0, abs=0.01)
 
 
@@ -293,25 +295,14 @@ VAL_ 316494249 Speed 0 "stands" ;
 def test_a_dbc_with_faults_that_other_tools_accept_is_read(tmp_path, capsys):
     """As those that enthusiasts keep of cars: one in six is refused by cantools for what nobody maps."""
     (tmp_path / "x.dbc").write_text(_FAULTY)
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: M.Angle}\n"
-        "  EMB_FL_Resolver.MotorSpeed: {signal: Long.Speed}\n  EMB_FL_Current.CurrentQ: {signal: Last.Iq}\n"
-    )
-    lines = []
+    signals = {"MotorAngle": "signal: M.Angle", "MotorSpeed": "signal: Long.Speed", "CurrentQ": "signal: Last.Iq"}
+    mapping, lines = write_mapping(tmp_path, "dbc: x.dbc", **signals), []
     for tick in range(500):
         at = f"({0.004 * tick:.6f}) can0"
         lines += [f"{at} 100#D007000000000000", f"{at} 12DD51A9#0000000000000000", f"{at} 101#6400000000000000"]
     (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
-    mapping = Mapping(tmp_path / "m.yaml")
-    told = capsys.readouterr().err
-    for left_out in (
-        "line 5 is no DBC's",
-        "line 7 is no DBC's",
-        "BO_ 1074005561",
-        "line 16 is no DBC's",
-        "says of Gone, not in",
-    ):
-        assert left_out in told
+    told, faulty_lines = capsys.readouterr().err, (f"line {number} is no DBC's" for number in (5, 7, 16))
+    assert all(left_out in told for left_out in (*faulty_lines, "BO_ 1074005561", "says of Gone, not in"))
     # What was of a message that is left out is not of the one before.
     assert {signal.name for signal in mapping.databases[None].get_message_by_name("M").signals} == {"Angle"}
     found = mapping.read(tmp_path / "x.log")
@@ -319,18 +310,15 @@ def test_a_dbc_with_faults_that_other_tools_accept_is_read(tmp_path, capsys):
     assert Decoder().columns(found, "EMB_FL_Current")["CurrentQ"][5:] == pytest.approx(1.0, abs=0.02)
     (tmp_path / "x.dbc").write_text("this is\nno DBC at all\n" * 100)
     with pytest.raises(InputError, match=r"x\.dbc: not a readable DBC"):
-        Mapping(tmp_path / "m.yaml")
+        Mapping(tmp_path / "mapping.yaml")
 
 
 def test_of_a_motor_that_stands_what_is_not_in_the_log_is_named(tmp_path):
     (tmp_path / "x.dbc").write_text(_FAULTY)
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
-        "  VEH_WheelSpeed.WheelSpeedFL: {signal: Long.Speed}\n"
-    )
+    mapping = write_mapping(tmp_path, "dbc: x.dbc", MotorAngle="value: 0", WheelSpeedFL="signal: Long.Speed")
     (tmp_path / "x.log").write_text("(0.000000) can0 100#00\n(0.004000) can0 100#00\n")
     with pytest.raises(InputError, match=r"no value of Long.Speed \(0x12dd51a9\) in it, .*; found 0x100"):
-        Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log")
+        mapping.read(tmp_path / "x.log")
 
 
 @pytest.mark.parametrize(
@@ -347,13 +335,10 @@ def test_what_the_dbc_calls_not_available_is_no_value(tmp_path, choice, is_value
         'VERSION ""\nBU_: T\nBO_ 256 M: 8 T\n SG_ Angle : 0|16@1+ (0.01,0) [0|0] "rad" T\n'
         f' SG_ Plate : 16|12@1+ (0.1,-40) [0|0] "degC" T\n\nVAL_ 256 Plate 4095 "{choice}" ;\n'
     )
-    plate = "EMB_FL_Thermocouple.InnerBackplateTemp"
-    (tmp_path / "m.yaml").write_text(
-        f"format: 1\ndbc: x.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: M.Angle}}\n  {plate}: {{signal: M.Plate}}\n"
-    )
+    mapping = write_mapping(tmp_path, "dbc: x.dbc", MotorAngle="signal: M.Angle", InnerBackplateTemp="signal: M.Plate")
     lines = [f"({0.004 * tick:.6f}) can0 100#{'D007FF0F' if tick % 50 < 25 else 'D0075802'}00000000" for tick in range(500)]
     (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
-    found = Decoder().columns(Mapping(tmp_path / "m.yaml").read(tmp_path / "x.log"), "EMB_FL_Thermocouple")
+    found = Decoder().columns(mapping.read(tmp_path / "x.log"), "EMB_FL_Thermocouple")
     assert len(found["InnerBackplateTemp"]) > 10
     assert set(np.round(found["InnerBackplateTemp"], 1)) == ({20.0, 369.5} if is_value else {20.0})
 
@@ -592,11 +577,7 @@ def test_a_trucks_mdf4_log_is_read_whole_and_mapped(shared, tmp_path, monkeypatc
     (tmp_path / "truck.dbc").write_text(
         'VERSION ""\nBU_: T\nBO_ 2566206452 Battery: 8 T\n SG_ Word : 32|16@1+ (0.01,-5) [0|0] "rad" T\n'
     )
-    (tmp_path / "mapping.yaml").write_text(
-        "format: 1\ndbc: truck.dbc\nsignals:\n"
-        "  EMB_FL_Resolver.MotorAngle: {signal: Battery.Word}\n"
-        "  EMB_FL_Resolver.MotorSpeed: {value: 0.0}\n"
-    )
+    write_mapping(tmp_path, "dbc: truck.dbc", MotorAngle="signal: Battery.Word", MotorSpeed="value: 0.0")
     mine = frames[frames["can_id"] == 0x18F533F4]
     words = (mine["data"] >> np.uint64(32) & np.uint64(0xFFFF)) * 0.01 - 5.0
     assert len(mine) == 3992 and np.ptp(words) > 50.0

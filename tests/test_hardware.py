@@ -52,6 +52,26 @@ def _log(columns: dict, **more):
     )
 
 
+def _drawn(time_s, angle, speed, current, force=0.0):
+    """A log of what a machine draws at these moments."""
+    columns = {"time_s": time_s, "angle_rad": angle, "current_A": current, "force_N": force + 0.0 * time_s}
+    return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+
+
+def _without_pads(**friction: float):
+    """A calibration to begin with, of an actuator whose clearance never closes."""
+    base = foreignkit.calibration()
+    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
+    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
+    return moved(stated, {f"friction.{name}": value for name, value in friction.items()})
+
+
+def _of_a_joint(inertia: float = 0.01, **friction: float):
+    """The same of a joint at its own shaft."""
+    motor = {"motor.torque_constant_Nm_per_A": 1.0, "motor.inertia_kg_m2": inertia}
+    return moved(_without_pads(load_m_per_rad=0.0, **friction), motor)
+
+
 def test_an_encoder_that_repeats_itself_at_rest_is_no_frozen_sensor(stops, monkeypatch):
     """Angles that stand to the bit, and no speed but their change: nothing else is known of most rigs."""
 
@@ -74,18 +94,15 @@ def test_a_calibration_without_friction_gives_numbers(stops):
 
 
 def test_a_load_of_either_sign_is_judged_by_the_torque_path_alone():
-    """An actuator on a dynamometer, whose clearance never closes: no pads, no curve, and a load that may pull."""
-    base = foreignkit.calibration()
-    alone = msgspec.structs.replace(base, contact=msgspec.structs.replace(base.contact, clearance_rad=1e4))
-    motor, friction = alone.motor, alone.friction
+    """An actuator on a dynamometer: no pads, no curve, and a load that may pull."""
+    without_load = _without_pads(load_m_per_rad=0.0)
+    motor, friction = without_load.motor, without_load.friction
     time_s = 0.004 * np.arange(3000)
     angle, speed = 20.0 * np.sin(2.0 * time_s), 40.0 * np.cos(2.0 * time_s)
     force = 5000.0 * np.sin(0.7 * time_s)
     torque = motor.gear_gain_m_per_rad * force - 80.0 * motor.inertia_kg_m2 * np.sin(2.0 * time_s)
     torque += friction.offset_Nm * np.sign(speed)
-    columns = {"time_s": time_s, "angle_rad": angle, "current_A": torque / motor.torque_constant_Nm_per_A, "force_N": force}
-    without_load = moved(alone, {"friction.load_m_per_rad": 0.0})
-    bench = Bench([_log(columns, speed_rad_per_s=speed, current_mean_s=0.0)], without_load)
+    bench = Bench([_drawn(time_s, angle, speed, torque / motor.torque_constant_Nm_per_A, force)], without_load)
     assert bench.channels == ["torque"] and whole(bench) == "torque"
     assert errors(bench, without_load).rmse("torque") < 250.0
     # What matters, and what rivals of a term differ by, are shares of the load.
@@ -96,24 +113,19 @@ def test_a_load_of_either_sign_is_judged_by_the_torque_path_alone():
 @pytest.mark.parametrize(("lacking", "told"), [("force_N", "no load reference .*value: 0"), ("current_A", "no motor current")])
 def test_a_motor_with_nothing_to_judge_by_is_told_what_lacks(lacking, told):
     """A motor that turns free has no load sensor, and knows its load: none."""
-    base = foreignkit.calibration()
-    alone = msgspec.structs.replace(base, contact=msgspec.structs.replace(base.contact, clearance_rad=1e4))
     time_s = 0.004 * np.arange(3000)
     known = {"current_A": np.sin(time_s), "force_N": np.zeros(3000)}
     del known[lacking]
     log = emb_daemon.log_of_arrays(time_s, 20.0 * np.sin(2.0 * time_s), wheel_speed_rad_per_s=0.0, **known)
     with pytest.raises(InputError, match=told):
-        Bench([log], alone)
+        Bench([log], _without_pads())
 
 
 def _on_a_dynamometer(scatter: float, load: float):
     """A motor of 0.85 of its stated constant that turns to and fro against a load: calibration, the true constant, and logs
     to fit and to judge. ``load``: share of its current that it gets from the load and does not draw from its own speed;
     ``scatter`` of friction, in A."""
-    base = foreignkit.calibration()
-    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
-    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
-    stated = moved(stated, {"friction.load_m_per_rad": 0.0})
+    stated = _without_pads(load_m_per_rad=0.0)
     motor, constant = stated.motor, 0.85 * stated.motor.torque_constant_Nm_per_A
 
     def log(seed: int, size_A: float):
@@ -126,8 +138,7 @@ def _on_a_dynamometer(scatter: float, load: float):
         lost += motor.inertia_kg_m2 * np.gradient(speed, time_s)
         force = (load * torque - (lost if load == 1.0 else 0.0)) / motor.gear_gain_m_per_rad
         current = (torque if load == 1.0 else load * torque + lost) / constant
-        columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": current, "force_N": force}
-        return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+        return _drawn(time_s, np.cumsum(speed) * 0.004, speed, current, force)
 
     return stated, constant, log(1, 3.0), log(2, 9.0)
 
@@ -159,8 +170,7 @@ def test_a_machine_whose_angles_have_jittered_stamps_of_their_own_shows_its_effe
         torque = stated.motor.gear_gain_m_per_rad * force + 1e-3 * rows["speed"]
         angle = np.interp(time_s + random.uniform(-0.003, 0.003, 6000), time_s, rows["angle"])
         current = rows["current_q"] + torque / stated.motor.torque_constant_Nm_per_A + random.normal(0.0, 0.05, 6000)
-        columns = {"time_s": time_s, "angle_rad": angle, "current_A": current, "force_N": force}
-        return _log(columns, speed_rad_per_s=rows["speed"], current_mean_s=0.0)
+        return _drawn(time_s, angle, rows["speed"], current, force)
 
     result = diagnose([log(1)], stated, [log(2)])
     [found] = result.accepted
@@ -179,8 +189,7 @@ def test_an_offset_shows_where_a_motor_turns_one_way_and_friction_cannot_be_less
         speed = 85.0 + 55.0 * np.interp(time_s % 8.0, [0.0, 2.0, 4.0, 6.0, 8.0], [0.0, 1.0, 1.0, 0.0, 0.0])
         current = 4.0 * (speed / 100.0) ** 2 + 0.3 * np.repeat(random.normal(size=300), 40)
         force = constant * (current + 2.0) / stated.motor.gear_gain_m_per_rad + 20.0 * random.normal(size=len(time_s))
-        columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": current, "force_N": force}
-        return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+        return _drawn(time_s, np.cumsum(speed) * 0.004, speed, current, force)
 
     found = diagnose([log(1)], stated, [log(2)])
     assert [c.effect.name for c in found.accepted] == ["current_offset"]
@@ -313,16 +322,11 @@ def test_what_a_free_motor_draws_is_not_explained_by_itself(validated):
 def test_the_friction_of_a_joint_is_found_though_no_brake_has_as_much(tmp_path):
     """At its own shaft a robot's joint has a thousand times the viscous friction of a brake's motor: its own current and speed
     say how much may be. What is found is a calibration like any other, but not of a brake."""
-    base = foreignkit.calibration()
-    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
-    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
-    values = {"motor.torque_constant_Nm_per_A": 1.0, "motor.inertia_kg_m2": 1e-3, "friction.load_m_per_rad": 0.0}
-    stated = moved(stated, values | {"friction.offset_Nm": 0.2})
+    stated = _of_a_joint(inertia=1e-3, offset_Nm=0.2)
     random, time_s = np.random.default_rng(5), 0.004 * np.arange(12000)
     speed = np.repeat(random.uniform(3.0, 20.0, 12), 1000) * np.sin(2.0 * np.pi * time_s / 1.0)
     torque = 0.2 * np.sign(speed) + 0.15 * speed + 1e-3 * np.gradient(speed, time_s) + 0.02 * random.normal(size=len(time_s))
-    columns = {"time_s": time_s, "angle_rad": np.cumsum(speed) * 0.004, "current_A": torque, "force_N": 0.0 * time_s}
-    found = diagnose([_log(columns, speed_rad_per_s=speed, current_mean_s=0.0)], stated).calibration
+    found = diagnose([_drawn(time_s, np.cumsum(speed) * 0.004, speed, torque)], stated).calibration
     assert found.effects["viscous_friction"]["viscous_Nms_per_rad"] == pytest.approx(0.15, rel=0.1)
     save_calibration(found, tmp_path / "found.yaml")
     assert load_calibration(tmp_path / "found.yaml").effects == found.effects
@@ -333,19 +337,14 @@ def test_the_friction_of_a_joint_is_found_though_no_brake_has_as_much(tmp_path):
 def _joint(presliding_rad: float, inertia: float):
     """A calibration to begin with, and half a minute of what a joint of 0.13 N m and 2e-4 kg m² draws that turns free, whose
     friction turns over within 2e-3 rad."""
-    base = foreignkit.calibration()
-    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
-    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
-    values = {"motor.torque_constant_Nm_per_A": 1.0, "motor.inertia_kg_m2": inertia, "friction.load_m_per_rad": 0.0}
-    stated = moved(stated, values | {"friction.offset_Nm": 0.2, "friction.presliding_angle_rad": presliding_rad})
+    stated = _of_a_joint(inertia, offset_Nm=0.2, presliding_angle_rad=presliding_rad)
     random, time_s = np.random.default_rng(3), 0.004 * np.arange(8000)
     angle = np.repeat(random.uniform(1.0, 5.0, 8), 1000) * (1.0 - np.cos(2.0 * np.pi * time_s / 1.0))
     speed, friction = np.gradient(angle, time_s), np.zeros(len(time_s))
     for row, way in enumerate(np.diff(angle), 1):
         friction[row] = np.clip(friction[row - 1] + way / 2e-3, -1.0, 1.0)
     torque = 0.13 * friction + 2e-4 * np.gradient(speed, time_s) + 0.02 * random.normal(size=len(time_s))
-    columns = {"time_s": time_s, "angle_rad": angle, "current_A": torque, "force_N": 0.0 * time_s}
-    return stated, _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
+    return stated, _drawn(time_s, angle, speed, torque)
 
 
 @pytest.mark.parametrize("inertia", [4e-3, 2e-4])
@@ -362,20 +361,6 @@ def test_friction_that_turns_over_at_once_and_a_light_rotor_are_found_from_a_bra
     before, after = found.before.rmse("torque"), found.after.rmse("torque")
     assert after < 1.3 * 0.02 * scale < before
     assert found.selection.recalibrated["torque"] == pytest.approx(np.sqrt(before**2 - after**2), rel=0.05)
-
-
-def _of_a_joint(**values: float):
-    """A calibration to begin with, of a joint at its own shaft that clamps nothing."""
-    base = foreignkit.calibration()
-    contact = msgspec.structs.replace(base.contact, clearance_rad=1e4)
-    stated = msgspec.structs.replace(base, contact=contact, provenance=None, effects={})
-    start = {"motor.torque_constant_Nm_per_A": 1.0, "friction.load_m_per_rad": 0.0, "motor.inertia_kg_m2": 0.01}
-    return moved(stated, start | {f"friction.{name}": value for name, value in values.items()})
-
-
-def _drawn(time_s, angle, speed, torque):
-    columns = {"time_s": time_s, "angle_rad": angle, "current_A": torque, "force_N": 0.0 * time_s}
-    return _log(columns, speed_rad_per_s=speed, current_mean_s=0.0)
 
 
 def _breakaways(seed: int):

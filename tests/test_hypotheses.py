@@ -63,6 +63,7 @@ from emb_daemon.models.fusion import (
     force_variance,
 )
 from emb_daemon.offline import estimate
+from emb_daemon.offline.stretches import stretches_of
 from emb_daemon.wire.contract import CONTACT_UNCERTAIN, PATHS_DISAGREE
 
 #: Samples of one stop of `brake.stops`, of its standstill at the beginning, and stops before the change.
@@ -169,17 +170,11 @@ def test_a_change_is_attributed_and_ends_in_a_small_error(p, name, seed):
             expected.get(what, 0.0), abs=max(nothing, 0.15 * abs(expected.get(what, 0.0)))
         ), what
     silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
-    assert _longest(silent) <= 25
+    assert np.max(np.ptp(stretches_of(silent), axis=1), initial=0) <= 25
     told = estimates["reasons"][-6 * _STOP :]
     assert not np.any(told & ~CONTACT_UNCERTAIN)
     # What jumped once may again: a sample or two at the beginning of a stop are open by more than a hundredth.
     assert np.mean(told != 0) < 0.002
-
-
-def _longest(mask):
-    """Length of the longest run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 @pytest.mark.parametrize("stops", [8, 40])
@@ -265,7 +260,7 @@ def test_a_motor_that_fades_with_heat_takes_no_stiffness_with_it(p, seed):
     assert rmse < 100.0 and sigma < 150.0 and beyond < 0.01
     assert state["scale"] == pytest.approx(1.0, abs=0.02)
     silent = (np.abs(estimates["force"] - force) > 3.0 * estimates["sigma"]) & (estimates["reasons"] == 0)
-    assert _longest(silent) <= 25
+    assert np.max(np.ptp(stretches_of(silent), axis=1), initial=0) <= 25
 
 
 @pytest.mark.parametrize("seed", range(6))

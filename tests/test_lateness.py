@@ -120,15 +120,6 @@ def test_an_older_speed_says_nothing_of_the_angle():
     assert _age(speed_late_s=0.003) == 0.0
 
 
-def _filtered(speeds, filter_s):
-    """Speeds through a first-order filter."""
-    shown, state = np.empty_like(speeds), speeds[0]
-    for row, speed in enumerate(speeds):
-        state += (speed - state) / (1.0 + filter_s / _DT)
-        shown[row] = state
-    return shown
-
-
 def _unfilter(a, angles, speeds):
     """Follow signals as the estimator does; the speeds that it takes them for."""
     m, taken, before = np.zeros(1, SAMPLE)[0], [speeds[0]], angles[0]
@@ -145,10 +136,10 @@ def _unfilter(a, angles, speeds):
 @pytest.mark.parametrize("filter_s", [0.004, 0.01, 0.03])
 def test_a_filter_of_the_speed_is_undone(filter_s):
     a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals()
-    taken = _unfilter(a, angles, _filtered(speeds, filter_s))
+    taken = _unfilter(a, angles, brake.filtered(speeds, filter_s / _DT))
     assert a["filtered"] == pytest.approx(filter_s, rel=0.1, abs=_DT / 2)
     left = np.std((taken - speeds)[250:])
-    assert left < 0.25 * np.std((_filtered(speeds, filter_s) - speeds)[250:])
+    assert left < 0.25 * np.std((brake.filtered(speeds, filter_s / _DT) - speeds)[250:])
 
 
 def test_a_filter_that_comes_while_driving_is_found_in_a_stroke_and_one_that_goes_is_forgotten():
@@ -156,7 +147,7 @@ def test_a_filter_that_comes_while_driving_is_found_in_a_stroke_and_one_that_goe
     _unfilter(a, angles, speeds)
     assert a["filtered"] == 0.0
     angles, speeds = _signals(seconds=1.0)
-    _unfilter(a, angles, _filtered(speeds, 0.015))
+    _unfilter(a, angles, brake.filtered(speeds, 0.015 / _DT))
     assert a["filtered"] == pytest.approx(0.015, rel=0.2)
     _unfilter(a, *_signals(seconds=2.0))
     assert a["filtered"] < _DT / 2
@@ -181,7 +172,7 @@ def test_neither_slip_nor_noise_is_a_filter():
 
 def test_a_filter_is_undone_up_to_twelve_cycles():
     a, (angles, speeds) = np.zeros(1, LATENESS)[0], _signals(seconds=20.0)
-    _unfilter(a, angles, _filtered(speeds, 0.055))
+    _unfilter(a, angles, brake.filtered(speeds, 0.055 / _DT))
     assert a["filtered"] == SLOWEST_S
 
 
@@ -423,7 +414,7 @@ def test_what_a_filtered_speed_hides_is_not_taken_for_another_brake(parameters, 
     """Without this inertia comes kilonewtons too late. It is kept over a restart."""
 
     def change(rows):
-        rows["speed"] = _filtered(rows["speed"], filter_s)
+        rows["speed"] = brake.filtered(rows["speed"], filter_s / _DT)
 
     samples, force = city.drive(seed, 40.0)
     samples, state = samples.copy(), new_state()
@@ -471,7 +462,7 @@ def test_what_was_seen_beside_another_speed_is_forgotten_with_it(parameters):
     and of the angle is void."""
     samples, _ = city.drive(0, 20.0)
     samples, state = samples.copy(), new_state()
-    samples["speed"] = _filtered(samples["speed"], 0.012)
+    samples["speed"] = brake.filtered(samples["speed"], 0.012 / _DT)
     out = None
     for row in range(len(samples)):
         before, out = out, estimate(samples[row : row + 1], parameters, state)[0]

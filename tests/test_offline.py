@@ -17,6 +17,7 @@ from emb_daemon.offline import estimate
 from emb_daemon.offline.fit import Block, Fit, Free, fit
 from emb_daemon.offline.run import held, run_paths, run_step, stiffness_force
 from emb_daemon.offline.score import EpisodeErrors, figures, force_figures, rmse, share_inside
+from emb_daemon.offline.stretches import stretches_of, without_gaps
 from emb_daemon.wire import contract
 
 
@@ -234,3 +235,10 @@ def test_blocks_of_a_fit_run_side_by_side_to_the_same_values():
 
     found = fit([block(1.0), block(3.0)], {"a": Free(0.0, 1e-6)})
     assert not both.broken and found.values["a"] == pytest.approx(1.6)
+
+
+def test_rows_are_parted_where_they_do_not_follow_one_another():
+    holds = np.array([True, True, False, False, True, False, True])
+    assert stretches_of(holds).tolist() == [[0, 2], [4, 5], [6, 7]] and not len(stretches_of(np.zeros(3, bool)))
+    rows = np.flatnonzero(holds)
+    assert [part.tolist() for part in without_gaps(rows, 10 * rows)] == [[0, 10], [40], [60]]

@@ -46,6 +46,10 @@ signals:
 """
 
 
+#: Of the one bus.
+_ALONE = "format: 1\ndbc: drive.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: Drive.Angle}\n"
+
+
 def _mapping(folder, first="can0", second="can1", text=_MAPPING) -> Mapping:
     (folder / "drive.dbc").write_text(_DRIVE)
     (folder / "bench.dbc").write_text(_BENCH)
@@ -95,8 +99,7 @@ def test_a_message_that_a_gateway_copies_is_read_once(columns, tmp_path):
             log(message)
             message.timestamp, message.channel = message.timestamp + 2e-4, "can1"
             log(message)
-    text = "format: 1\ndbc: drive.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: Drive.Angle}\n"
-    log = load_log(tmp_path / "a.log", read=_mapping(tmp_path, text=text).read)
+    log = load_log(tmp_path / "a.log", read=_mapping(tmp_path, text=_ALONE).read)
     # Without a current the last sample still waits for one.
     assert len(log.samples) == len(columns["time_s"]) - 1
     assert np.abs(log.samples["angle"] - columns["angle_rad"][:-1]).max() < 0.002
@@ -139,8 +142,7 @@ def test_several_live_buses_are_received_by_channel(columns, tmp_path):
 
 
 def test_two_of_ours_from_one_of_theirs_keep_their_scales(tmp_path):
-    text = "format: 1\ndbc: drive.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: Drive.Angle}\n"
-    text += "  EMB_FR_Resolver.MotorAngle: {signal: Drive.Angle, scale: -2.0}\n"
+    text = _ALONE + "  EMB_FR_Resolver.MotorAngle: {signal: Drive.Angle, scale: -2.0}\n"
     bus = MappedBus(SeveralBuses({}), _mapping(tmp_path, text=text))
     drive = cantools.database.load_string(_DRIVE, "dbc").get_message_by_name("Drive")
     frame = can.Message(0.0, 291, False, data=drive.encode({"Angle": 3.0, "Current": 0.0}))
@@ -150,8 +152,7 @@ def test_two_of_ours_from_one_of_theirs_keep_their_scales(tmp_path):
 
 
 def test_ids_of_the_daemon_are_not_taken_on_a_rig(tmp_path, capsys):
-    text = "format: 1\ndbc: drive.dbc\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: Drive.Angle}\n"
-    _mapping(tmp_path, text=text)
+    _mapping(tmp_path, text=_ALONE)
     (tmp_path / "drive.dbc").write_text(_DRIVE.replace("BO_ 291 Drive", "BO_ 512 Drive"))
     mapping = Mapping(tmp_path / "mapping.yaml")
     with pytest.raises(InputErrors, match="Drive of the rig has id 0x200, with which the daemon sends"):

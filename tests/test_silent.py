@@ -15,9 +15,9 @@ from emb_daemon.wire.contract import ADAPTING, DEGRADED, FAULT, FUSED, INVALID, 
 from emb_daemon.wire.e2e import crc
 from emb_daemon.wire.layout import default_layout, unpack
 from studies import senders, unlisted
-from studies.faults import Size, alter, lose, size_of
+from studies.faults import Fault, Size, alter, lose, size_of
 from studies.grid import FAMILIES, brake_of, draw_drive, drive, prepare
-from studies.phases import first_flag_s, judge
+from studies.phases import first_flag_s, judge, verdict
 from studies.silent import main
 
 TIME_S = 0.004 * np.arange(5000)
@@ -127,6 +127,14 @@ def test_the_first_flag_is_the_first_after_the_onset(honest, told):
     honest[field][100], honest[field][2000] = value, value
     assert first_flag_s(TIME_S, honest, 2.0) == pytest.approx(8.0 - 2.0)
     assert np.isnan(first_flag_s(TIME_S, honest, 9.0))
+
+
+def test_a_verdict_counts_trainings_and_has_the_first_flag_from_its_onset(honest):
+    honest["adapt_result"][[*range(500, 600), *range(900, 1000)]] = RESULT_ACCEPTED
+    honest["mode"][[100, 2000]] = FAULT
+    told = verdict("any", 7, Fault("one of two", 1.0), TIME_S, honest, 2.0, [judge("all", TIME_S, honest, FORCE_N)])
+    assert (told["trained"], told["first_flag_s"], told["onset_s"]) == (2, pytest.approx(6.0), 1.0)
+    assert told["phases"][0]["name"] == "all" and (told["family"], told["number"], told["size"]) == ("any", 7, "one of two")
 
 
 def test_a_changed_signal_leaves_the_frame_whole(frames):

@@ -5,6 +5,7 @@ import re
 import foreignkit
 import numpy as np
 import pytest
+from foreignkit import columns_of, load_mapped, read, write_mapping
 from scipy.signal import lfilter
 
 from emb_daemon.cli.main import main
@@ -26,10 +27,9 @@ def truth():
     return foreignkit.truth(foreignkit.random(seconds=3.0))
 
 
-def _read(folder, columns: dict, mapping: str = foreignkit.COLUMNS):
-    foreignkit.write_rig(folder, mapping)
-    table = foreignkit.write_table(folder / "a.parquet", columns)
-    return load_log(table, read=Mapping(folder / "mapping.yaml").read)
+@pytest.fixture
+def columns(truth):
+    return foreignkit.sampled(truth, 250.0)
 
 
 def _twice(columns):
@@ -66,12 +66,11 @@ def _shuffled(columns):
     ],
     ids=["twice", "10 ms", "5 ms", "15.6 ms", "batches", "out of order"],
 )  # fmt: skip
-def test_stamps_of_recorders_are_put_right(truth, tmp_path, capsys, change, said, most_s):
+def test_stamps_of_recorders_are_put_right(columns, tmp_path, capsys, change, said, most_s):
     """Sample by sample the log is the one with right stamps, but for a delay that all its signals share."""
-    columns = foreignkit.sampled(truth, 250.0)
-    samples = _read(tmp_path, columns).samples
+    samples = read(tmp_path, columns).samples
     assert capsys.readouterr().err == ""
-    log = _read(tmp_path, change(columns))
+    log = read(tmp_path, change(columns))
     assert said in capsys.readouterr().err
     assert len(log.samples) == len(samples)
     for name in ("angle", "speed", "current_q", "reasons"):
@@ -80,18 +79,16 @@ def test_stamps_of_recorders_are_put_right(truth, tmp_path, capsys, change, said
     assert np.ptp(late[20:-20]) < 2.0 * most_s
 
 
-def test_values_stamped_before_the_clock_was_set_are_left_out(truth, tmp_path, capsys):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_values_stamped_before_the_clock_was_set_are_left_out(columns, tmp_path, capsys):
     late = columns["time_s"] + np.where(np.arange(len(columns["time_s"])) < 3, 111.0, 0.0)
-    log = _read(tmp_path, columns | {"time_s": late})
+    log = read(tmp_path, columns | {"time_s": late})
     assert f"after value 3: 3 of {len(late)} values of another time left out" in capsys.readouterr().err
-    samples = _read(tmp_path, columns).samples
+    samples = read(tmp_path, columns).samples
     assert np.array_equal(log.samples["angle"], samples["angle"][3:])
 
 
-def test_what_was_recorded_before_a_trigger_is_a_log_too(truth, tmp_path):
+def test_what_was_recorded_before_a_trigger_is_a_log_too(columns, tmp_path):
     """An oscilloscope counts from its trigger; no log that anybody reads has times below zero."""
-    columns = foreignkit.sampled(truth, 250.0)
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     table = foreignkit.write_table(tmp_path / "a.csv", columns | {"time_s": columns["time_s"] - 0.5})
     arguments = ["convert", table, "--mapping", tmp_path / "mapping.yaml", "--output", tmp_path / "ours.log"]
@@ -112,10 +109,8 @@ def test_a_counter_that_is_full_and_a_clock_at_midnight_go_on(tmp_path, unit, st
         written = np.rint(stamps).astype(int).tolist()
     rows = "".join(f"{time},{0.008 * n:.3f}\n" for n, time in enumerate(written))
     (tmp_path / "a.csv").write_text("t,angle\n" + rows)
-    (tmp_path / "m.yaml").write_text(
-        f"format: 1\ntime: {{signal: t, unit: {unit}}}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: angle, unit: rad}}\n"
-    )
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    write_mapping(tmp_path, f"time: {{signal: t, unit: {unit}}}", MotorAngle="signal: angle, unit: rad")
+    log = load_mapped(tmp_path / "a.csv")
     assert log.time_s[-1] - log.time_s[0] == pytest.approx(3.996, abs=0.005)
     assert np.abs(log.samples["speed"][5:-5] - 2.0).max() < 0.05
 
@@ -131,10 +126,8 @@ def test_seconds_and_their_parts_in_two_columns_are_one_time(tmp_path, capsys, m
     (tmp_path / "a.csv").write_text(
         ",".join([*order.split(), "angle"]) + "\n" + "".join(f"{a},{b},{x:.4f}\n" for a, b, x in rows)
     )
-    (tmp_path / "m.yaml").write_text(
-        f"format: 1\ntime: {mapped}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {{signal: angle, unit: rad}}\n"
-    )
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    write_mapping(tmp_path, f"time: {mapped}", MotorAngle="signal: angle, unit: rad")
+    log = load_mapped(tmp_path / "a.csv")
     said = capsys.readouterr().err
     assert "nanosec is the part of what sec counts" in said and "bunches" not in said
     assert np.abs(log.samples["angle"] - 2.0 * (1e-9 * log.time_ns - 1.7e9)).max() < 0.01
@@ -149,10 +142,8 @@ def test_what_does_not_begin_anew_with_each_second_is_no_part_of_it(tmp_path, ca
     count = (counts | {"rolling": row % 1000})[beside]
     lines = "".join(f"{r // 50},{c},{0.04 * r:.3f}\n" for r, c in zip(row, count, strict=True))
     (tmp_path / "a.csv").write_text("t,count,angle\n" + lines)
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: angle, unit: rad}\n"
-    )
-    load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    write_mapping(tmp_path, "time: {signal: t, unit: s}", MotorAngle="signal: angle, unit: rad")
+    load_mapped(tmp_path / "a.csv")
     said = capsys.readouterr().err
     assert "stamps come in bunches, one every 1e+03 ms" in said and "is the part" not in said
 
@@ -163,11 +154,11 @@ def test_a_signal_that_is_held_in_a_finer_raster_is_taken_at_its_own_rate(truth,
     own = foreignkit.sampled(truth, 250.0)
     row = np.maximum(np.searchsorted(own["time_s"], fine["time_s"] + 1e-9, side="right") - 1, 0)
     held = fine | {"current_A": own["current_A"][row]}
-    late, right = ((_read(tmp_path, columns).samples["current_q"]) for columns in (held, fine))
+    late, right = ((read(tmp_path, columns).samples["current_q"]) for columns in (held, fine))
     assert np.std((late - right)[5:]) < 0.5
     slow = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=6.0)), 250.0)
     stairs = np.repeat(slow["force_N"][::10], 10)[: len(slow["time_s"])]
-    assert np.abs(_read(tmp_path, slow | {"force_N": stairs}).force_N - slow["force_N"])[20:-20].max() < 250.0
+    assert np.abs(read(tmp_path, slow | {"force_N": stairs}).force_N - slow["force_N"])[20:-20].max() < 250.0
     assert np.abs(stairs - slow["force_N"]).max() > 500.0
 
 
@@ -197,18 +188,16 @@ def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
     ],
     ids=["ms", "us", "s as us", "days of a spreadsheet", "year", "outlier", "no clock", "two recordings"],
 )
-def test_times_that_cannot_be_are_refused(truth, tmp_path, time_s, said):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_times_that_cannot_be_are_refused(columns, tmp_path, time_s, said):
     with pytest.raises(InputError) as caught:
-        _read(tmp_path, columns | {"time_s": time_s(columns["time_s"])})
+        read(tmp_path, columns | {"time_s": time_s(columns["time_s"])})
     assert said in str(caught.value) and str(caught.value).startswith(f"{tmp_path / 'a.parquet'}: ")
 
 
-def test_of_times_that_cannot_be_nothing_else_is_said(truth, tmp_path, capsys):
+def test_of_times_that_cannot_be_nothing_else_is_said(columns, tmp_path, capsys):
     """Slow motion, late signals and gaps of minutes are then its consequence, and the gear's ratio no remedy."""
-    columns = foreignkit.sampled(truth, 250.0)
     with pytest.raises(InputError):
-        _read(tmp_path, columns | {"time_s": 1e3 * columns["time_s"]})
+        read(tmp_path, columns | {"time_s": 1e3 * columns["time_s"]})
     assert " FL: " not in capsys.readouterr().err
 
 
@@ -218,13 +207,13 @@ def test_a_counter_or_milliseconds_taken_for_seconds_are_asked_for(truth, tmp_pa
     columns = foreignkit.sampled(truth, rate_Hz)
     slow = {name: 0.2 * columns[name] for name in ("angle_rad", "speed_rad_per_s")}
     counted = columns | slow | {"time_s": 7000.0 + np.arange(len(columns["time_s"]))}
-    _read(tmp_path, counted)
+    read(tmp_path, counted)
     said = capsys.readouterr().err
     assert "or a counter's? Then `rate_Hz`" in said and "by the gear's ratio" not in said
     mapping = foreignkit.COLUMNS.replace("{signal: time_s}", f"{{signal: time_s, rate_Hz: {rate_Hz:g}}}")
-    _read(tmp_path, counted, mapping)
+    read(tmp_path, counted, mapping)
     assert "rate_Hz" not in capsys.readouterr().err
-    _read(tmp_path, {name: values[:: int(rate_Hz / 7)] for name, values in columns.items()})
+    read(tmp_path, {name: values[:: int(rate_Hz / 7)] for name, values in columns.items()})
     said = capsys.readouterr().err
     assert "too rare" in said and "rate_Hz" not in said
 
@@ -234,7 +223,7 @@ def test_a_clock_that_is_set_while_recording_costs_no_memory(truth, tmp_path):
     columns = foreignkit.sampled(truth, 500.0)
     time_s = foreignkit.START_S + columns["time_s"]
     time_s[:5] -= foreignkit.START_S
-    log = _read(tmp_path, columns | {"time_s": time_s})
+    log = read(tmp_path, columns | {"time_s": time_s})
     assert 0.99 * 750 < len(log.samples) < 1.01 * 750
     assert np.ptp(log.samples["angle"]) > 15.0
 
@@ -266,49 +255,49 @@ _MOTION = ("angle_rad", "speed_rad_per_s")
         (("plate_C",), 295.0 / 22.0, "InnerBackplateTemp is never below 295 °C: are these kelvins?"),
     ],
 )
-def test_what_no_brake_does_is_said(truth, tmp_path, capsys, wrong, factor, said):
-    columns = foreignkit.sampled(truth, 250.0)
-    _read(tmp_path, _wrong(columns, *wrong, factor=factor))
+def test_what_no_brake_does_is_said(columns, tmp_path, capsys, wrong, factor, said):
+    read(tmp_path, _wrong(columns, *wrong, factor=factor))
     assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("step_s", "said"),
-    [(1.0, ""), (1000.0, "comes once in 1000 s, in which a brake has cooled"), (1.0 / 60.0, "K/s, as no backing plate does")],
+    ("step_s", "count", "said"),
+    [
+        (1.0, 3600, ""),
+        (1000.0, 250, "comes once in 1000 s, in which a brake has cooled"),
+        (1.0 / 60.0, 3600, "K/s, as no backing plate does"),
+    ],
     ids=["seconds", "milliseconds taken for them", "minutes"],
 )
-def test_a_plate_that_cools_tells_the_unit_of_time(tmp_path, capsys, step_s, said):
+def test_a_plate_that_cools_tells_the_unit_of_time(tmp_path, capsys, step_s, count, said):
     """Heated for half an hour and let cool; nothing else was measured."""
-    ticks = np.arange(3600)
+    ticks = np.arange(count)
     plate = 22.0 + 160.0 * np.where(ticks < 1800, 1.0 - np.exp(-ticks / 500.0), np.exp((1800 - ticks) / 700.0))
-    noisy = plate + np.random.default_rng(1).normal(0.0, 0.5, 3600)
+    noisy = plate + np.random.default_rng(1).normal(0.0, 0.5, count)
     rows = [f"{step_s * tick:.6f},{value:.3f}" for tick, value in zip(ticks.tolist(), noisy.tolist(), strict=True)]
     (tmp_path / "a.csv").write_text("\n".join(["t,plate", *rows]) + "\n")
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: t}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
-        "  EMB_FL_Thermocouple.InnerBackplateTemp: {signal: plate, unit: degC}\n"
+    mapping = write_mapping(
+        tmp_path, "time: {signal: t}", MotorAngle="value: 0", InnerBackplateTemp="signal: plate, unit: degC"
     )
-    Mapping(tmp_path / "m.yaml").read(tmp_path / "a.csv")
+    mapping.read(tmp_path / "a.csv")
     told = capsys.readouterr().err
     assert said in told and ("a brake has cooled" in told or "as no backing plate" in told) == bool(said)
 
 
-def test_noise_of_a_thermocouple_in_a_short_log_tells_no_unit_of_time(truth, tmp_path, capsys):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_noise_of_a_thermocouple_in_a_short_log_tells_no_unit_of_time(columns, tmp_path, capsys):
     noise_K = np.random.default_rng(1).normal(0.0, 2.0, len(columns["time_s"]))
-    _read(tmp_path, {name: values[:250] for name, values in (columns | {"plate_C": 22.0 + noise_K}).items()})
+    read(tmp_path, {name: values[:250] for name, values in (columns | {"plate_C": 22.0 + noise_K}).items()})
     assert "K/s" not in capsys.readouterr().err
 
 
-def test_a_current_that_is_nothing_but_zero_is_none(truth, tmp_path, capsys):
+def test_a_current_that_is_nothing_but_zero_is_none(columns, tmp_path, capsys):
     """As a measured one it would tell the torque path that nothing clamps: 9 kN of error."""
-    columns = foreignkit.sampled(truth, 250.0)
     columns["current_A"] = 0.0 * columns["current_A"]
     for mapping in (foreignkit.COLUMNS, re.sub(r"(EMB_FL_Current.CurrentQ): .*", r"\1: {value: 0}", foreignkit.COLUMNS)):
-        assert not _read(tmp_path, columns, mapping).samples["has_current"].any()
+        assert not read(tmp_path, columns, mapping).samples["has_current"].any()
     # A motor that stands needs none.
     columns |= {name: 0.0 * columns[name] for name in ("angle_rad", "speed_rad_per_s")}
-    assert _read(tmp_path, columns).samples["has_current"].any()
+    assert read(tmp_path, columns).samples["has_current"].any()
 
 
 def test_a_brake_that_is_said_to_be_released_has_no_force(tmp_path, capsys):
@@ -324,7 +313,7 @@ def test_a_brake_that_is_said_to_be_released_has_no_force(tmp_path, capsys):
         (clamped, re.sub(r"(ParkBrake): .*", r"\1: {value: 1}", released), False),
         (clamped | {"force_N": clamped["force_N"] + 60_000.0}, released, False),
     ):
-        _read(tmp_path, log, mapping)
+        read(tmp_path, log, mapping)
         assert ("ClampForceRef begins at" in capsys.readouterr().err) == said
 
 
@@ -340,8 +329,8 @@ def test_a_load_that_no_angle_tells_is_of_no_other_time(tmp_path, capsys, motion
         "yields": 4e-3 * np.roll(load, 10),
         "to and fro": 20.0 * np.cos(9.0 * time_s),
     }[motion]
-    columns = {"time_s": time_s, "angle_rad": 0.004 * np.cumsum(speed), "speed_rad_per_s": speed}
-    _read(tmp_path, columns | {"current_A": 1e-3 * load, "plate_C": 22.0 + 0.0 * time_s, "force_N": load})
+    angle = 0.004 * np.cumsum(speed)
+    read(tmp_path, columns_of(time_s, angle_rad=angle, speed_rad_per_s=speed, current_A=1e-3 * load, force_N=load))
     assert "ClampForceRef comes" not in capsys.readouterr().err
 
 
@@ -352,14 +341,13 @@ def test_a_force_that_falls_at_every_time_is_of_none(recwarn):
     assert not [one for one in recwarn if one.category is RuntimeWarning]
 
 
-def test_gaps_are_told_with_their_place_and_length(truth, tmp_path, capsys):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_gaps_are_told_with_their_place_and_length(columns, tmp_path, capsys):
     time_s = columns["time_s"]
     for name in ("angle_rad", "current_A"):
         columns[name] = np.where((time_s > 1.0) & (time_s < 1.5), np.nan, columns[name])
     columns["current_A"][10:50] = np.nan
     columns["force_N"][300:310] = np.nan
-    _read(tmp_path, columns)
+    read(tmp_path, columns)
     said = capsys.readouterr().err
     assert "MotorAngle: a gap of 0.5 s, 0.996 s after the first value" in said
     assert "CurrentQ: 2 gaps, together 0.664 s, the longest of 0.5 s" in said
@@ -374,10 +362,9 @@ def test_gaps_are_told_with_their_place_and_length(truth, tmp_path, capsys):
         (0.02, ""),
     ],
 )
-def test_a_force_of_another_clock_is_said(truth, tmp_path, capsys, late_s, said):
+def test_a_force_of_another_clock_is_said(columns, tmp_path, capsys, late_s, said):
     """Identification would make effects of it, and judging would call the estimate wrong."""
-    columns = foreignkit.sampled(truth, 250.0)
-    _read(tmp_path, columns | {"force_N": np.roll(columns["force_N"], round(250.0 * late_s))})
+    read(tmp_path, columns | {"force_N": np.roll(columns["force_N"], round(250.0 * late_s))})
     told = capsys.readouterr().err
     assert said in told
     assert bool(said) == ("that it belongs to" in told)
@@ -412,31 +399,29 @@ def test_a_vehicle_rolls_on_tyres(factor, is_said):
 
 
 @pytest.mark.parametrize(("step_A", "bits"), [(0.002, 16), (0.05, 12)])
-def test_a_current_that_lost_its_sign_is_said_and_has_it_by_its_period(truth, tmp_path, capsys, step_A, bits):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_a_current_that_lost_its_sign_is_said_and_has_it_by_its_period(columns, tmp_path, capsys, step_A, bits):
     counts = np.mod(np.rint(columns["current_A"] / step_A), 2.0**bits)
     written = columns | {"current_A": step_A * counts}
-    _read(tmp_path, written)
+    read(tmp_path, written)
     whole = f"{step_A * 2.0**bits:.10g}"
     assert f"current_A jumps between 0 and {whole}, the end of its bits" in (told := capsys.readouterr().err)
     assert f"Then `period: {whole}`" in told and told.count("jumps between") == 1
     mapping = foreignkit.COLUMNS.replace("current_A, unit: A", f"current_A, unit: A, period: {whole}")
-    log = _read(tmp_path, written, mapping)
+    log = read(tmp_path, written, mapping)
     assert "jumps between" not in capsys.readouterr().err
-    plain = _read(tmp_path, columns)
+    plain = read(tmp_path, columns)
     assert log.samples["current_q"] == pytest.approx(plain.samples["current_q"], abs=0.6 * step_A + 0.006)
 
 
-def test_a_position_of_32_bits_may_begin_below_zero(truth, tmp_path, capsys):
+def test_a_position_of_32_bits_may_begin_below_zero(columns, tmp_path, capsys):
     """As a drive's counts are written that knows no sign, and printed with eight digits."""
-    columns = foreignkit.sampled(truth, 250.0)
     counts = np.mod(np.rint(columns["angle_rad"] * 1e4) - 3.0, 2.0**32)
     counts = np.array([float(f"{count:.8g}") for count in counts])
-    _read(tmp_path, columns | {"angle_rad": counts})
+    read(tmp_path, columns | {"angle_rad": counts})
     assert "angle_rad jumps between 0 and 4294967296" in capsys.readouterr().err
     mapping = foreignkit.COLUMNS.replace("angle_rad, unit: rad", f"angle_rad, unit: rad, scale: 1e-4, period: {2**32}")
-    log = _read(tmp_path, columns | {"angle_rad": counts}, mapping)
-    assert log.samples["angle"] == pytest.approx(_read(tmp_path, columns).samples["angle"], abs=0.03)
+    log = read(tmp_path, columns | {"angle_rad": counts}, mapping)
+    assert log.samples["angle"] == pytest.approx(read(tmp_path, columns).samples["angle"], abs=0.03)
 
 
 @pytest.mark.parametrize(
@@ -463,13 +448,12 @@ def test_one_stroke_like_the_other_is_no_turn():
 
 
 @pytest.mark.parametrize("stray", [0.0, -999.0, 1200.0])
-def test_single_values_far_from_those_beside_them_are_no_motion(truth, tmp_path, capsys, stray):
+def test_single_values_far_from_those_beside_them_are_no_motion(columns, tmp_path, capsys, stray):
     """What stands for a lost value must not be taken for an angle that starts anew, nor for motion."""
-    columns = foreignkit.sampled(truth, 250.0)
     lost = np.random.default_rng(3).random(len(columns["time_s"])) < 0.005
     lost[np.flatnonzero(lost) - 1] = False
     lost &= columns["angle_rad"] > 15.0
-    log = _read(tmp_path, columns | {"angle_rad": np.where(lost, stray, columns["angle_rad"] + 5.0)})
+    log = read(tmp_path, columns | {"angle_rad": np.where(lost, stray, columns["angle_rad"] + 5.0)})
     told = capsys.readouterr().err
     how = "values are -999, which stand for none" if stray == -999.0 else "values of MotorAngle are far from both beside them"
     assert f"{np.sum(lost)} {how}: left out" in told and "start anew" not in told
@@ -485,17 +469,20 @@ def test_a_rare_stroke_is_no_stray():
     assert np.flatnonzero(strays(angle)).tolist() == [1000]
 
 
+def _replay(folder, columns: dict) -> None:
+    foreignkit.write_rig(folder, foreignkit.COLUMNS)
+    table = foreignkit.write_table(folder / "a.parquet", columns)
+    command = ["replay", table, "--mapping", folder / "mapping.yaml", "--calibration", folder / "calibration.yaml"]
+    assert main([str(word) for word in command]) == 0
+
+
 def _phase(columns: dict) -> np.ndarray:
     return columns["current_A"] * np.cos(4.0 * columns["angle_rad"])
 
 
 @pytest.mark.parametrize("current", [_phase, lambda columns: 0.3 * columns["speed_rad_per_s"]], ids=["phase", "duty cycle"])
-def test_what_does_not_accelerate_the_motor_is_not_its_current(truth, tmp_path, capsys, current):
-    columns = foreignkit.sampled(truth, 250.0)
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    foreignkit.write_table(tmp_path / "a.parquet", columns | {"current_A": current(columns)})
-    command = ["replay", str(tmp_path / "a.parquet"), "--mapping", str(tmp_path / "mapping.yaml")]
-    assert main([*command, "--calibration", str(tmp_path / "calibration.yaml")]) == 0
+def test_what_does_not_accelerate_the_motor_is_not_its_current(columns, tmp_path, capsys, current):
+    _replay(tmp_path, columns | {"current_A": current(columns)})
     assert "the current does not accelerate the motor" in capsys.readouterr().err
 
 
@@ -529,15 +516,13 @@ def _ramps(current: np.ndarray) -> np.ndarray:
         "each value five times",
     ],
 )
-def test_a_command_in_place_of_the_measured_current_is_said(truth, made, said):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_a_command_in_place_of_the_measured_current_is_said(columns, made, said):
     values = made(columns["current_A"])
     lines = find_command(Series(4_000_000 * np.arange(len(values)), values))
     assert [line for line in lines if "as a command's do" in line] == lines and bool(lines) == said
 
 
-def test_a_command_is_said_of_a_table(truth, tmp_path, capsys):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_a_command_is_said_of_a_table(columns, tmp_path, capsys):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     table = foreignkit.write_table(tmp_path / "a.parquet", columns | {"current_A": _steps(columns["current_A"])})
     command = ["convert", str(table), "--mapping", str(tmp_path / "mapping.yaml"), "--output", str(tmp_path / "a.log")]
@@ -550,16 +535,20 @@ def test_a_command_is_said_of_a_table(truth, tmp_path, capsys):
     [(1.0, ""), (1.0 / 20.0, "times what is stated: is the angle that of a gear's output"), (-1.0, "backwards")],
     ids=["the motor's", "behind a gear", "turned round"],
 )
-def test_an_angle_of_another_place_is_told_by_the_inertia(truth, tmp_path, capsys, factor, said):
+def test_an_angle_of_another_place_is_told_by_the_inertia(columns, tmp_path, capsys, factor, said):
     """Convert cannot tell it, since an angle behind a gear is a motion like any other; a calibration can."""
-    columns = foreignkit.sampled(truth, 250.0)
-    foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    foreignkit.write_table(tmp_path / "a.parquet", _wrong(columns, *_MOTION, factor=factor))
-    command = ["replay", str(tmp_path / "a.parquet"), "--mapping", str(tmp_path / "mapping.yaml")]
-    assert main([*command, "--calibration", str(tmp_path / "calibration.yaml")]) == 0
+    _replay(tmp_path, _wrong(columns, *_MOTION, factor=factor))
     told = capsys.readouterr().err
     assert said in told
     assert bool(said) == ("the current accelerates the motor" in told)
+
+
+def _samples_of(columns: dict) -> np.ndarray:
+    samples = np.zeros(len(columns["time_s"]), SAMPLE)
+    samples["time_ns"], samples["has_current"] = 1e9 * columns["time_s"], True
+    for field, column in (("angle", "angle_rad"), ("speed", "speed_rad_per_s"), ("current_q", "current_A")):
+        samples[field] = columns[column]
+    return samples
 
 
 @pytest.mark.parametrize(
@@ -571,11 +560,7 @@ def test_an_angle_of_another_place_is_told_by_the_inertia(truth, tmp_path, capsy
 def test_a_current_of_another_scale_is_told_by_load_and_acceleration(truth, factor, said, stiffer):
     """Other pads, whose force is another at the same angle, do not pass for it: what the sensor shows is taken."""
     columns = foreignkit.sampled(foreignkit.truth(foreignkit.random(seconds=10.0)), 250.0)
-    samples = np.zeros(len(columns["time_s"]), SAMPLE)
-    samples["time_ns"], samples["has_current"] = 1e9 * columns["time_s"], True
-    for field, column in (("angle", "angle_rad"), ("speed", "speed_rad_per_s"), ("current_q", "current_A")):
-        samples[field] = columns[column]
-    samples["current_q"] *= factor
+    samples = _samples_of(_wrong(columns, "current_A", factor=factor))
     motor = foreignkit.calibration().motor
     told = other_current(samples, stiffer * columns["force_N"], motor)
     assert [line.startswith(said) for line in told] == ([True] if said and stiffer == 1.0 else [])
@@ -585,32 +570,24 @@ def test_a_current_of_another_scale_is_told_by_load_and_acceleration(truth, fact
 def test_rare_samples_tell_no_inertia():
     """Between two of them a motor is accelerated and braked again: some 8 times the inertia would come out."""
     columns = foreignkit.sampled(foreignkit.truth(foreignkit.random(seconds=120.0)), 20.0, means=False)
-    samples = np.zeros(len(columns["time_s"]), SAMPLE)
-    samples["time_ns"], samples["has_current"] = 1e9 * columns["time_s"], True
-    for field, column in (("angle", "angle_rad"), ("speed", "speed_rad_per_s"), ("current_q", "current_A")):
-        samples[field] = columns[column]
+    samples = _samples_of(columns)
     motor = foreignkit.calibration().motor
     assert not other_motor(samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2)
 
 
-def test_a_flag_between_no_and_yes_is_said(truth, tmp_path, capsys):
-    """A brake request of 37 per cent, scaled to one, would be sent as none."""
-    columns = foreignkit.sampled(truth, 250.0)
-    flag = {"request": np.where(np.arange(len(columns["time_s"])) % 100 < 50, 0.0, 0.37)}
-    mapping = re.sub(r"(VEH_Status.BrakeRequest): .*", r'\1: {signal: request, unit: "1"}', foreignkit.COLUMNS)
-    _read(tmp_path, columns | flag, mapping)
-    assert "BrakeRequest is 0 or 1, and between them in" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("one", "is_said"), [(1.0 + 1e-9, False), (100.0, True)])
-def test_a_flag_of_a_coarse_factor_is_one(truth, tmp_path, capsys, one, is_said):
-    """A DBC whose factor makes 1.000000001 of what it means by 1; per cent are no flag."""
-    columns = foreignkit.sampled(truth, 250.0)
+@pytest.mark.parametrize(
+    ("one", "said"),
+    [(1.0 + 1e-9, ""), (100.0, "a `scale` 100 times smaller"), (0.37, "BrakeRequest is 0 or 1, and between them in")],
+)
+def test_a_flag_of_a_coarse_factor_is_one(columns, tmp_path, capsys, one, said):
+    """A DBC whose factor makes 1.000000001 of what it means by 1; per cent are no flag, and a brake request of 37 per cent,
+    scaled to one, would be sent as none."""
     flag = {"request": np.where(np.arange(len(columns["time_s"])) % 100 < 50, 0.0, one)}
     mapping = re.sub(r"(VEH_Status.BrakeRequest): .*", r'\1: {signal: request, unit: "1"}', foreignkit.COLUMNS)
-    log = _read(tmp_path, columns | flag, mapping)
-    assert ("a `scale` 100 times smaller" in capsys.readouterr().err) == is_said
-    assert (np.mean(log.slow.status["BrakeRequest"]) == pytest.approx(0.5, abs=0.1)) != is_said
+    log = read(tmp_path, columns | flag, mapping)
+    told = capsys.readouterr().err
+    assert said in told and ("BrakeRequest is" in told) == bool(said)
+    assert (np.mean(log.slow.status["BrakeRequest"]) == pytest.approx(0.5, abs=0.1)) == (not said)
 
 
 def test_a_clock_of_whole_seconds_is_spread_over_its_rows(capsys):
@@ -622,9 +599,8 @@ def test_a_clock_of_whole_seconds_is_spread_over_its_rows(capsys):
     assert np.diff(times) == pytest.approx(4e6, rel=0.2)
 
 
-def test_late_stamps_are_no_missing_samples(truth, tmp_path):
+def test_late_stamps_are_no_missing_samples(columns, tmp_path):
     """Counters that skip would be E2E errors of a log that lacks nothing; where samples are missing, they do skip."""
-    columns = foreignkit.sampled(truth, 250.0)
     late_s = np.random.default_rng(1).normal(0.0, 0.0008, len(columns["time_s"])).clip(-0.0019, 0.0019)
     rows = np.r_[0:300, 310 : len(late_s)]
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
@@ -638,7 +614,7 @@ def test_late_stamps_are_no_missing_samples(truth, tmp_path):
 
 def test_an_angle_within_one_turn_asks_for_its_period(truth, tmp_path, capsys):
     columns = foreignkit.sampled(truth, 500.0)
-    _read(tmp_path, columns | {"angle_rad": columns["angle_rad"] % (2.0 * np.pi)})
+    read(tmp_path, columns | {"angle_rad": columns["angle_rad"] % (2.0 * np.pi)})
     assert "does it start anew? Then state its `period`" in capsys.readouterr().err
 
 
@@ -647,25 +623,19 @@ def _joint(period_rad: float = 0.0, jitter_ms: float = 0.0) -> dict:
     time_s = np.arange(2400) / 48.0 + 1e-3 * jitter_ms * np.random.default_rng(1).uniform(-1.0, 1.0, 2400)
     angle = 40.0 * (1.0 - np.cos(2.0 * np.pi * time_s / 25.0))
     speed = 40.0 * 2.0 * np.pi / 25.0 * np.sin(2.0 * np.pi * time_s / 25.0)
-    return {
-        "time_s": time_s - time_s[0],
-        "angle_rad": (angle + 12.5) % period_rad - 12.5 if period_rad else angle,
-        "speed_rad_per_s": speed,
-        "current_A": 0.5 * np.sign(speed),
-        "plate_C": 22.0 + 0.0 * speed,
-        "force_N": 0.0 * speed,
-    }
+    angle = (angle + 12.5) % period_rad - 12.5 if period_rad else angle
+    return columns_of(time_s - time_s[0], angle_rad=angle, speed_rad_per_s=speed, current_A=0.5 * np.sign(speed))
 
 
 def test_an_angle_of_few_samples_that_starts_anew_is_told_from_a_fast_motion(tmp_path, capsys):
-    _read(tmp_path, _joint(period_rad=25.0))
+    read(tmp_path, _joint(period_rad=25.0))
     told = capsys.readouterr().err
     jump = float(re.search(r"MotorAngle jumps by about ([\d.]+) rad and back to and fro", told)[1])
     assert jump == pytest.approx(25.0, abs=0.1) and "too rare" not in told
     still = _joint()
     # A motor that really goes as far between two samples goes anywhere.
     still["angle_rad"] = np.repeat(np.random.default_rng(2).choice([0.0, 20.0, 30.0], 240), 10)
-    _read(tmp_path, still | {"speed_rad_per_s": np.gradient(still["angle_rad"], still["time_s"])})
+    read(tmp_path, still | {"speed_rad_per_s": np.gradient(still["angle_rad"], still["time_s"])})
     assert "start anew" not in capsys.readouterr().err
 
 
@@ -676,13 +646,10 @@ def _hoist(**factors: float) -> dict:
     time_s = np.arange(1240) / 31.0
     speed = 6.0 * np.clip(4.0 * np.sin(2.0 * np.pi * time_s / 20.0), -1.0, 1.0) + rng.normal(0.0, 0.05, 1240)
     late = rng.uniform(0.0, 0.01, 1240) + 0.1 * (rng.uniform(size=1240) < 0.05)
-    columns = {
-        "time_s": np.maximum.accumulate(time_s + late) + 1e-6 * np.arange(1240),
-        "angle_rad": np.cumsum(speed) / 31.0,
-        "speed_rad_per_s": speed,
-        "current_A": 5.0 + np.sign(speed) + rng.normal(0.0, 0.2, 1240),
-        "plate_C": np.full(1240, 22.0),
-    }
+    stamps, current = np.maximum.accumulate(time_s + late), 5.0 + np.sign(speed) + rng.normal(0.0, 0.2, 1240)
+    columns = columns_of(
+        stamps + 1e-6 * np.arange(1240), angle_rad=np.cumsum(speed) / 31.0, speed_rad_per_s=speed, current_A=current
+    )
     return {name: factors.get(name, 1.0) * values for name, values in columns.items()}
 
 
@@ -706,7 +673,7 @@ def test_a_hoist_of_late_rows_tells_a_wrong_unit_and_direction(tmp_path, capsys,
         (_hoist(**wrong), stated),
         (_hoist(**wrong) | {"force_N": np.full(1240, 4000.0)}, foreignkit.COLUMNS),
     ):
-        _read(tmp_path, columns, mapping)
+        read(tmp_path, columns, mapping)
         told = capsys.readouterr().err
         assert said in told and ("scale" in told or "times as fast" in told) == bool(said)
         assert "too rare for this motion: what lies between two samples is unknown, and is not filled in" in told
@@ -714,7 +681,7 @@ def test_a_hoist_of_late_rows_tells_a_wrong_unit_and_direction(tmp_path, capsys,
 
 def test_slow_motion_with_the_stamps_of_a_busy_computer_is_not_too_rare(tmp_path, capsys):
     """Ten radians a second, stamped up to six milliseconds early or late, as it was sampled."""
-    samples = _read(tmp_path, _joint(jitter_ms=6.0)).samples
+    samples = read(tmp_path, _joint(jitter_ms=6.0)).samples
     assert "too rare" not in capsys.readouterr().err and np.median(samples["dt"]) == pytest.approx(0.004)
 
 
@@ -725,12 +692,9 @@ def test_lines_of_a_serial_port_that_name_their_values_are_a_table(tmp_path, cap
     lines = [f"Time: {t:.3f}, Angle = {a:.5f} rad Current:{c:.2f}" for t, a, c in pairs]
     lines.insert(900, "DONE POSITIONING")
     (tmp_path / "serial.txt").write_text("\n".join(lines))
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: Time, unit: ms}\nsignals:\n"
-        "  EMB_FL_Resolver.MotorAngle: {signal: Angle, unit: rad}\n"
-        "  EMB_FL_Current.CurrentQ: {signal: column 3, unit: A, mean_ms: 0}\n"
-    )
-    samples = load_log(tmp_path / "serial.txt", read=Mapping(tmp_path / "m.yaml").read).samples
+    angle, current = "signal: Angle, unit: rad", "signal: column 3, unit: A, mean_ms: 0"
+    write_mapping(tmp_path, "time: {signal: Time, unit: ms}", MotorAngle=angle, CurrentQ=current)
+    samples = load_mapped(tmp_path / "serial.txt").samples
     assert "1 rows with another number of cells than 3 left out" in capsys.readouterr().err
     assert len(samples) > 10_000 and np.ptp(samples["angle"]) == pytest.approx(80.0, rel=0.01)
     assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
@@ -746,11 +710,8 @@ def test_a_line_for_each_signal_is_a_table_of_columns(tmp_path, capsys, named, d
     lines = [delimiter.join(row).replace(*(".", ",") if delimiter == ";" else (".", ".")) for row in rows]
     (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
     clock, angle = ("t", "angle") if named else ("column 1", "column 2")
-    (tmp_path / "m.yaml").write_text(
-        f"format: 1\ntime: {{signal: {clock}, unit: s}}\nsignals:\n"
-        f"  EMB_FL_Resolver.MotorAngle: {{signal: {angle}, unit: rad}}\n"
-    )
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    write_mapping(tmp_path, f"time: {{signal: {clock}, unit: s}}", MotorAngle=f"signal: {angle}, unit: rad")
+    log = load_mapped(tmp_path / "a.csv")
     assert f"each of the 3 lines has {1000 + named} cells" in capsys.readouterr().err
     assert len(log.samples) >= 999 and np.abs(log.samples["angle"] - 2.0 * log.time_s).max() < 1e-3
 
@@ -760,10 +721,8 @@ def test_a_table_of_many_columns_and_few_rows_is_none_of_lines(tmp_path, capsys)
     names = ["t", "angle", *(f"cell {n}" for n in range(300))]
     rows = [[0.02 * n, 0.1 * n, *[0] * 300] for n in range(40)]
     (tmp_path / "a.csv").write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]))
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {signal: angle, unit: rad}\n"
-    )
-    log = load_log(tmp_path / "a.csv", read=Mapping(tmp_path / "m.yaml").read)
+    write_mapping(tmp_path, "time: {signal: t, unit: s}", MotorAngle="signal: angle, unit: rad")
+    log = load_mapped(tmp_path / "a.csv")
     assert "lines has" not in capsys.readouterr().err and log.samples["angle"][-1] > 3.7
 
 
@@ -780,12 +739,12 @@ def test_a_trace_of_a_plc_is_a_table_of_its_variables(tmp_path, capsys, decimal)
         ]
     lines.insert(900, "; 1.2.3; 4")
     (tmp_path / "axis.trace.csv").write_text("\n".join(lines) + "\n")
-    (tmp_path / "m.yaml").write_text(
-        "format: 1\ntime: {signal: Time, unit: ms}\nsignals:\n"
-        "  EMB_FL_Resolver.MotorAngle: {signal: Axis.fActPosition, unit: rad}\n"
-        "  EMB_FL_Current.CurrentQ: {signal: Axis.fActCurrent, unit: A, mean_ms: 0}\n"
-    )
-    samples = load_log(tmp_path / "axis.trace.csv", read=Mapping(tmp_path / "m.yaml").read).samples
+    signals = {
+        "MotorAngle": "signal: Axis.fActPosition, unit: rad",
+        "CurrentQ": "signal: Axis.fActCurrent, unit: A, mean_ms: 0",
+    }
+    write_mapping(tmp_path, "time: {signal: Time, unit: ms}", **signals)
+    samples = load_mapped(tmp_path / "axis.trace.csv").samples
     assert "left out" not in capsys.readouterr().err
     assert len(samples) > 10_000 and np.ptp(samples["angle"]) == pytest.approx(80.0, rel=0.01)
     assert np.nanmax(samples["current_q"]) == pytest.approx(0.5)
@@ -793,9 +752,7 @@ def test_a_trace_of_a_plc_is_a_table_of_its_variables(tmp_path, capsys, decimal)
 
 def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
     time_s = 0.004 * np.arange(1000)
-    still = 0.0 * time_s
-    columns = {"time_s": time_s, "angle_rad": 25.0 * time_s, "speed_rad_per_s": 25.0 * 30.0 / np.pi + still}
-    _read(tmp_path, columns | {"current_A": 1.0 + still, "plate_C": 22.0 + still, "force_N": still})
+    read(tmp_path, columns_of(time_s, angle_rad=25.0 * time_s, speed_rad_per_s=25.0 * 30.0 / np.pi, current_A=1.0))
     assert "rpm taken for rad/s, or the reverse" in capsys.readouterr().err
     assert not [warning for warning in recwarn if warning.category is RuntimeWarning]
 
@@ -813,7 +770,7 @@ def test_a_steady_speed_in_another_unit_is_said(tmp_path, capsys, recwarn):
 def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_turn, said):
     columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow()), 250.0)
     turns = 3.0 * columns["angle_rad"] / (2.0 * np.pi)
-    _read(tmp_path, columns | {"angle_rad": per_turn * (turns % 1.0)})
+    read(tmp_path, columns | {"angle_rad": per_turn * (turns % 1.0)})
     assert said in capsys.readouterr().err
 
 
@@ -821,7 +778,7 @@ def test_a_turn_is_told_in_the_unit_that_it_is_likely_in(tmp_path, capsys, per_t
 def test_counts_that_were_mapped_as_another_unit_are_counts(tmp_path, capsys, unit):
     columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS).replace("angle_rad, unit: rad", f"angle_rad, unit: {unit}")
-    _read(tmp_path, columns | {"angle_rad": np.rint(5e4 * columns["angle_rad"])}, mapping)
+    read(tmp_path, columns | {"angle_rad": np.rint(5e4 * columns["angle_rad"])}, mapping)
     assert "counts of an encoder? Then `unit: rev`" in capsys.readouterr().err
 
 
@@ -832,7 +789,7 @@ def test_counts_of_a_joint_that_turns_slowly_are_counts(tmp_path, capsys, unit, 
     way = 40.0 * np.sin(np.linspace(0.0, 30.0, len(columns["time_s"])))
     mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS).replace("angle_rad, unit: rad", f"angle_rad, unit: {unit}")
     for angle, is_whole in ((np.rint(way), is_asked), (way, False), (np.rint(way / 30.0), False)):
-        _read(tmp_path, columns | {"angle_rad": angle}, mapping)
+        read(tmp_path, columns | {"angle_rad": angle}, mapping)
         assert ("counts of an encoder? Then `unit: rev`" in capsys.readouterr().err) == is_whole
 
 
@@ -850,7 +807,7 @@ def test_an_angle_in_another_unit_is_told_without_a_speed(tmp_path, capsys, per_
     columns = foreignkit.sampled(foreignkit.truth(), rate_Hz)
     angle = per_rad * columns["angle_rad"] + 0.3
     mapping = re.sub(r"\n.*MotorSpeed.*", "", foreignkit.COLUMNS)
-    _read(tmp_path, columns | {"angle_rad": np.rint(angle) if whole else angle}, mapping)
+    read(tmp_path, columns | {"angle_rad": np.rint(angle) if whole else angle}, mapping)
     lines = [line for line in capsys.readouterr().err.splitlines() if "which no motor does" in line]
     assert len(lines) == bool(said) and all(said in line for line in lines)
 
@@ -859,7 +816,7 @@ def test_a_part_of_a_log_is_no_contradiction(truth, tmp_path, capsys):
     """Neither hard motion alone nor a clamped, a held, or a released brake alone says that anything is turned round."""
     columns = foreignkit.sampled(foreignkit.truth(), 250.0)
     for start in range(0, len(columns["time_s"]) - 400, 800):
-        _read(tmp_path, {name: values[start : start + 400] for name, values in columns.items()})
+        read(tmp_path, {name: values[start : start + 400] for name, values in columns.items()})
         assert "scale: -1" not in capsys.readouterr().err, start
 
 
@@ -868,8 +825,8 @@ def test_a_load_that_pulls_as_it_pushes_is_no_clamp_that_is_turned_round(tmp_pat
     time_s = 0.004 * np.arange(5000)
     angle = 2.5 * np.sin(2.0 * np.pi * 0.2 * time_s) + 1.8
     load = 6000.0 * np.sin(angle + 2.0)
-    columns = {"time_s": time_s, "angle_rad": angle, "speed_rad_per_s": np.gradient(angle, time_s)}
-    _read(tmp_path, columns | {"current_A": 5e-4 * load, "plate_C": 22.0 + 0.0 * time_s, "force_N": load})
+    speed = np.gradient(angle, time_s)
+    read(tmp_path, columns_of(time_s, angle_rad=angle, speed_rad_per_s=speed, current_A=5e-4 * load, force_N=load))
     assert "scale: -1" not in capsys.readouterr().err
 
 
@@ -880,14 +837,8 @@ def test_a_joint_stated_at_its_motor_is_sampled_as_often_as_it_was(tmp_path, cap
     mapping = foreignkit.COLUMNS.replace("signal: force_N, unit: N", load)
     time_s = 0.02 * np.arange(1000)
     angle = 300.0 * np.sin(2.0 * np.pi * 0.25 * time_s)
-    still = 0.0 * time_s
-    columns = {
-        "time_s": time_s,
-        "angle_rad": angle,
-        "speed_rad_per_s": np.gradient(angle, time_s),
-        "current_A": np.sign(still + 1),
-    }
-    log = _read(tmp_path, columns | {"plate_C": 22.0 + still, "force_N": 100.0 * np.abs(np.sin(time_s))}, mapping)
+    speed, force = np.gradient(angle, time_s), 100.0 * np.abs(np.sin(time_s))
+    log = read(tmp_path, columns_of(time_s, angle_rad=angle, speed_rad_per_s=speed, current_A=1.0, force_N=force), mapping)
     told = "too rare for this motion" in capsys.readouterr().err
     assert told == ("value" not in load) and (len(log.samples) > 4000) == ("value" in load)
 
@@ -897,7 +848,7 @@ def test_neither_inertia_nor_slow_samples_are_a_contradiction(tmp_path, capsys, 
     """At the top of a fast sine the current brakes the motor; between slow samples the motor goes its way."""
     time_s = foreignkit.FINE_S * np.arange(round(8.0 / foreignkit.FINE_S))
     sine = foreignkit.parameters()["clearance"] + 10.0 + 4.0 * np.sin(2.0 * np.pi * 5.0 * time_s)
-    _read(tmp_path, foreignkit.sampled(foreignkit.truth(sine if rate_Hz > 100.0 else foreignkit.random()), rate_Hz))
+    read(tmp_path, foreignkit.sampled(foreignkit.truth(sine if rate_Hz > 100.0 else foreignkit.random()), rate_Hz))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == (rate_Hz < 100.0) and all("one sample of the motor every 80 ms, too rare" in line for line in lines)
 
@@ -908,7 +859,7 @@ def test_a_few_stops_in_a_long_rest_are_not_filled_in(truth, tmp_path, capsys):
     rest = {name: np.full(100 * len(values), values[0]) for name, values in columns.items()}
     rest["time_s"] = 0.05 * np.arange(len(rest["time_s"]))
     columns["time_s"] = columns["time_s"] + rest["time_s"][-1]
-    log = _read(tmp_path, {name: np.concatenate([rest[name], columns[name]]) for name in columns})
+    log = read(tmp_path, {name: np.concatenate([rest[name], columns[name]]) for name in columns})
     assert "one sample of the motor every 50 ms, too rare" in capsys.readouterr().err
     assert len(log.samples) <= 101 * len(columns["time_s"])
 
@@ -925,7 +876,7 @@ def test_a_few_stops_in_a_long_rest_are_not_filled_in(truth, tmp_path, capsys):
 def test_a_slow_clamp_that_is_turned_round_is_told_at_any_rate(tmp_path, capsys, rate_Hz, wrong, said):
     """20 Hz do for a slow clamp, whose way between two samples is known; all that is turned round fits together."""
     columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=20.0)), rate_Hz)
-    _read(tmp_path, _wrong(columns, *wrong))
+    read(tmp_path, _wrong(columns, *wrong))
     told = capsys.readouterr().err
     assert said in told and ("scale: -1" in told) == bool(said)
 
@@ -1000,11 +951,10 @@ def test_a_unit_in_the_file_that_is_not_the_mappings_is_said(truth, tmp_path, ca
     ],
     ids=["nines", "largest float", "filled with zeros", "end of a sensor", "coarse", "bursts"],
 )
-def test_numbers_that_stand_for_none_are_no_force(truth, tmp_path, capsys, force, said, least_N):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_numbers_that_stand_for_none_are_no_force(columns, truth, tmp_path, capsys, force, said, least_N):
     noisy = columns["force_N"] + np.random.default_rng(5).normal(0, 25, 749)
     columns["force_N"] = np.round(force(noisy, columns["time_s"]), 3)
-    log = _read(tmp_path, columns)
+    log = read(tmp_path, columns)
     told = capsys.readouterr().err
     assert said in told and ("which stand for none" in told) == bool(said)
     assert least_N < np.nanmin(log.force_N) and np.nanmax(log.force_N) < 40e3
@@ -1030,14 +980,10 @@ def test_a_standing_wheel_may_be_measured_a_little_below_zero(tmp_path, capsys, 
     """A zero error of some tenths of a kilometre an hour makes no unknown speed."""
     time_s = 0.1 * np.arange(400)
     speed = np.where(np.arange(400) % 2, 100.0, least_kmh)
-    columns = {"t": time_s, "v": speed}
-    (tmp_path / "a.csv").write_text("t,v\n" + "\n".join(f"{t:.1f},{v}" for t, v in zip(*columns.values(), strict=True)))
-    (tmp_path / "mapping.yaml").write_text(
-        "format: 1\ntime: {signal: t, unit: s}\nsignals:\n  EMB_FL_Resolver.MotorAngle: {value: 0}\n"
-        "  VEH_Status.VehicleSpeed: {signal: v, unit: km/h}\n  VEH_Status.BrakeRequest: {value: 0}\n"
-        "  VEH_Status.ParkBrake: {value: 0}\n  VEH_Status.AmbientTemp: {value: 20}\n"
-    )
-    frames = Mapping(tmp_path / "mapping.yaml").read(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("t,v\n" + "\n".join(f"{t:.1f},{v}" for t, v in zip(time_s, speed, strict=True)))
+    stated = dict.fromkeys(("MotorAngle", "BrakeRequest", "ParkBrake", "AmbientTemp"), "value: 0")
+    mapping = write_mapping(tmp_path, "time: {signal: t, unit: s}", VehicleSpeed="signal: v, unit: km/h", **stated)
+    frames = mapping.read(tmp_path / "a.csv")
     told, sent = capsys.readouterr().err, np.sum(frames["can_id"] == 0x182)
     assert abs(sent * 1e8 / np.ptp(frames["time_ns"]) - measured) < 0.1
     assert ("VehicleSpeed is beyond 0 to 655.35" in told) == (measured < 1.0) and "times smaller" not in told
@@ -1054,19 +1000,17 @@ def test_a_standing_wheel_may_be_measured_a_little_below_zero(tmp_path, capsys, 
     ],
     ids=["a recorder that ended", "nothing below zero", "an amplifier's end", "coarse", "coarse in the clearance"],
 )
-def test_a_force_that_stays_while_the_motor_turns_is_said(truth, tmp_path, capsys, force, said):
+def test_a_force_that_stays_while_the_motor_turns_is_said(columns, tmp_path, capsys, force, said):
     """Judged by it, every estimate would be wrong."""
-    columns = foreignkit.sampled(truth, 250.0)
     columns["force_N"] = force(columns["force_N"] + np.random.default_rng(5).normal(0, 25, 749), columns["time_s"])
-    _read(tmp_path, columns)
+    read(tmp_path, columns)
     told = capsys.readouterr().err
     assert said in told and ("while the motor turns by" in told) == bool(said)
 
 
-def test_a_spreadsheets_days_are_a_unit_of_time(truth, tmp_path):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_a_spreadsheets_days_are_a_unit_of_time(columns, tmp_path):
     days = columns | {"time_s": 45000.0 + columns["time_s"] / 86400.0}
-    log = _read(tmp_path, days, foreignkit.COLUMNS.replace("signal: time_s}", "signal: time_s, unit: d}"))
+    log = read(tmp_path, days, foreignkit.COLUMNS.replace("signal: time_s}", "signal: time_s, unit: d}"))
     assert np.ptp(log.time_s) == pytest.approx(np.ptp(columns["time_s"]), abs=0.01)
 
 
@@ -1091,10 +1035,11 @@ _OF_MESSAGES, _PACKED = "is not read; expected what it holds as CSV", "is not re
 )
 def test_what_is_no_log_is_refused_with_what_would_do(tmp_path, begins, said):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
-    for name, read in (("a.csv", Mapping(tmp_path / "mapping.yaml").read), ("a.log", read_frames), ("a.blf", read_frames)):
+    mapped = Mapping(tmp_path / "mapping.yaml").read
+    for name, reads in (("a.csv", mapped), ("a.log", read_frames), ("a.blf", read_frames)):
         (tmp_path / name).write_bytes(begins + bytes(200))
         with pytest.raises(InputError, match=f"^{tmp_path / name}: .*{re.escape(said)}[^\n]*$"):
-            read(tmp_path / name)
+            reads(tmp_path / name)
 
 
 _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)
@@ -1105,7 +1050,7 @@ _NO_ANGLE = re.sub(r"\n.*MotorAngle.*", "", foreignkit.COLUMNS)
 def test_a_torque_sensor_the_wrong_way_round_is_told_without_an_angle(tmp_path, capsys, motion, factor, said):
     """A motor on a dynamometer: speed, current and torque, no angle."""
     columns = foreignkit.sampled(foreignkit.truth(motion()), 250.0)
-    _read(tmp_path, _wrong(columns, "force_N", factor=factor), _NO_ANGLE)
+    read(tmp_path, _wrong(columns, "force_N", factor=factor), _NO_ANGLE)
     told = capsys.readouterr().err
     assert said in told and ("scale: -1" in told) == bool(said)
 
@@ -1116,7 +1061,7 @@ def test_inertia_alone_turns_no_torque_sensor_round(tmp_path, capsys):
     sine = foreignkit.parameters()["clearance"] + 10.0 + 4.0 * np.sin(2.0 * np.pi * 7.0 * time_s)
     columns = foreignkit.sampled(foreignkit.truth(sine), 500.0)
     assert np.corrcoef(columns["current_A"], columns["force_N"])[0, 1] < -0.6
-    _read(tmp_path, columns, _NO_ANGLE)
+    read(tmp_path, columns, _NO_ANGLE)
     assert "scale: -1" not in capsys.readouterr().err
 
 
@@ -1140,11 +1085,10 @@ def test_friction_drives_no_motor(tmp_path, capsys, load, factor, of_current, sa
     current = 0.02 * force + 0.8 * np.sign(speed) + 2e-4 * np.gradient(speed, time_s) + rng.normal(0.0, 0.1, len(time_s))
     if not load:
         current += 0.5 * (angle < -25.0)
-    columns = {"time_s": time_s, "angle_rad": factor * angle, "speed_rad_per_s": factor * speed}
-    columns["current_A"] = of_current * current
+    motion = {"angle_rad": factor * angle, "speed_rad_per_s": factor * speed}
     free = foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}")
-    columns |= {"force_N": force, "plate_C": 22.0 + 0.0 * time_s}
-    _read(tmp_path, columns, foreignkit.COLUMNS if load else free)
+    columns = columns_of(time_s, **motion, current_A=of_current * current, force_N=force)
+    read(tmp_path, columns, foreignkit.COLUMNS if load else free)
     told = capsys.readouterr().err
     assert said in told and told.count("scale: -1") == bool(said)
 
@@ -1169,10 +1113,11 @@ def test_a_current_of_another_time_than_its_load_is_said(tmp_path, capsys, late_
         return 20.0 * np.sin(2.0 * np.pi * 5.0 * at_s) + 10.0 * np.sin(2.0 * np.pi * 3.1 * at_s)
 
     speed = 5.0 * np.sin(2.0 * np.pi * 0.4 * time_s)
-    columns = {"time_s": time_s, "angle_rad": -2.0 * np.cos(2.0 * np.pi * 0.4 * time_s), "speed_rad_per_s": speed}
-    columns |= {"current_A": current(time_s - late_s) + np.sign(speed), "force_N": 1000.0 * current(time_s)}
+    motion = {"angle_rad": -2.0 * np.cos(2.0 * np.pi * 0.4 * time_s), "speed_rad_per_s": speed}
+    late_A = current(time_s - late_s) + np.sign(speed)
     mapped = "" if mean_ms is None else f", mean_ms: {mean_ms}"
-    _read(tmp_path, columns | {"plate_C": 22.0 + 0.0 * time_s}, foreignkit.COLUMNS.replace("unit: A", f"unit: A{mapped}"))
+    columns = columns_of(time_s, **motion, current_A=late_A, force_N=1000.0 * current(time_s))
+    read(tmp_path, columns, foreignkit.COLUMNS.replace("unit: A", f"unit: A{mapped}"))
     told = capsys.readouterr().err
     assert said in told and ("that it belongs to" in told) == bool(said)
 
@@ -1243,9 +1188,9 @@ def test_what_our_messages_would_round_away_is_said(tmp_path, capsys, factor, sa
     """A robot's joint, at its own shaft, takes minutes for a turn, and its spring makes none. What stands is not too slow."""
     time_s = 0.004 * np.arange(20000)
     speed = 73.0 * factor * np.sin(0.1 * time_s)
-    columns = {"time_s": time_s, "angle_rad": -730.0 * factor * np.cos(0.1 * time_s), "speed_rad_per_s": speed}
-    columns |= {"current_A": 40.0 * factor * np.sign(speed), "force_N": 0.0 * time_s, "plate_C": 22.0 + 0.0 * time_s}
-    _read(tmp_path, columns, foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}"))
+    angle, current = -730.0 * factor * np.cos(0.1 * time_s), 40.0 * factor * np.sign(speed)
+    columns = columns_of(time_s, angle_rad=angle, speed_rad_per_s=speed, current_A=current)
+    read(tmp_path, columns, foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}"))
     told = capsys.readouterr().err
     assert all(line in told for line in said) and ("covers" in told) == bool(said), told
 
@@ -1255,12 +1200,11 @@ def test_a_brake_that_stands_is_no_contradiction(tmp_path, capsys):
     rng, count = np.random.default_rng(1), 800
     noise = {"speed_rad_per_s": 0.3, "current_A": 0.2, "plate_C": 0.0, "force_N": 20.0}
     columns = {"time_s": 0.004 * np.arange(count), "angle_rad": 5.0 + 0.0015 * rng.integers(0, 2, count)}
-    _read(tmp_path, columns | {name: rng.normal(0.0, sigma, count) for name, sigma in noise.items()})
+    read(tmp_path, columns | {name: rng.normal(0.0, sigma, count) for name, sigma in noise.items()})
     assert capsys.readouterr().err == ""
 
 
-def test_a_log_of_two_recordings_ends_a_command_with_one_line(truth, tmp_path, capsys):
-    columns = foreignkit.sampled(truth, 250.0)
+def test_a_log_of_two_recordings_ends_a_command_with_one_line(columns, tmp_path, capsys):
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     table = foreignkit.write_table(tmp_path / "a.csv", {name: np.tile(values, 2) for name, values in columns.items()})
     assert main(["replay", str(table), "--mapping", str(tmp_path / "mapping.yaml")]) == 2
@@ -1405,17 +1349,16 @@ def test_a_recording_that_begins_and_ends_in_a_full_number_is_no_other():
 
 
 def test_what_was_recorded_as_another_current_is_left_out_and_said(tmp_path, capsys):
-    needed = _needed()
-    told = _driven(needed)
+    told = _driven(needed := _needed())
     angle = np.cumsum(told["speed"].values) / 300.0
-    columns = {"time_s": 1e-9 * told["current"].time_ns, "angle_rad": angle, "speed_rad_per_s": told["speed"].values}
-    columns |= {"plate_C": 22.0 + 0.0 * angle, "force_N": told["force"].values}
+    motion = {"angle_rad": angle, "speed_rad_per_s": told["speed"].values}
+    columns = columns_of(1e-9 * told["current"].time_ns, **motion, force_N=told["force"].values)
     full = (needed + 30.0) % 60.0 - 30.0
     gone = np.sum((np.abs(needed) > 30.0) | (full == full.max()) | (full == full.min()))
-    log = _read(tmp_path, columns | {"current_A": full})
+    log = read(tmp_path, columns | {"current_A": full})
     said = capsys.readouterr().err
     assert f"its number was full; {gone} of 9000 values are left out" in said
     known = log.samples["has_current"]
     assert 0.8 < np.mean(known) < 0.999
-    _read(tmp_path, columns | {"current_A": needed})
+    read(tmp_path, columns | {"current_A": needed})
     assert "number was full" not in capsys.readouterr().err

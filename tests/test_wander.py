@@ -93,21 +93,20 @@ def _beyond(estimates, force):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("rad_per_s", [-0.1, 0.1])
-def test_a_slow_drift_is_told_within_half_a_minute_and_covered(p, rad_per_s, seed):
-    begin = 7500
-    estimates, force = _estimated(p, _drift(rad_per_s, begin), seed)
+@pytest.mark.parametrize(
+    ("change", "begin", "within_s"),
+    [
+        (_drift(-0.1, 7500), 7500, 30.0),
+        (_drift(0.1, 7500), 7500, 30.0),
+        (lambda rows: brake.lose_counts(rows, 0.005), 0, 60.0),
+    ],
+    ids=["drift", "drift ahead", "half a percent of lost counts"],
+)
+def test_a_slow_drift_is_told_within_half_a_minute_and_covered(p, change, begin, within_s, seed):
+    """Lost counts within a minute."""
+    estimates, force = _estimated(p, change, seed)
     told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
-    assert len(told) and begin < told[0] < begin + 30 / _DT
-    assert np.mean(estimates["source"] == r.FUSED) > 0.99
-    assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_half_a_percent_of_lost_counts_is_told_and_covered(p, seed):
-    estimates, force = _estimated(p, lambda rows: brake.lose_counts(rows, 0.005), seed)
-    told = np.flatnonzero(estimates["reasons"] & r.OUT_OF_RANGE)
-    assert len(told) and told[0] < 60 / _DT
+    assert len(told) and begin < told[0] < begin + within_s / _DT
     assert np.mean(estimates["source"] == r.FUSED) > 0.99
     assert np.mean(_beyond(estimates, force)[told[0] :]) < 0.02
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from emb_daemon.atomic import write_atomically
 from emb_daemon.demo.recorder import Comparison, Recorder
+from emb_daemon.offline.stretches import stretches_of
 
 _ESTIMATE, _TRUTH, _SPEED = "#0b6fb8", "#1a1a1a", "#9aa0a6"
 _CORNERS = ("#0b6fb8", "#d1495b", "#2e933c", "#b07d12")
@@ -91,8 +92,7 @@ def _draw_heat(axes, time: np.ndarray, truth: np.ndarray, estimated_s: np.ndarra
 
 
 def _mark_parked(axes, time: np.ndarray, where: np.ndarray) -> None:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, end in stretches_of(where):
         left, right = time[start], time[min(end, len(time) - 1)]
         axes.axvspan(left, right, color="#f0ead6", zorder=0)
         middle, across = 0.5 * (left + right), axes.get_xaxis_transform()

@@ -36,6 +36,7 @@ from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline.levels import force_error_levels, integral_time, lasting_share
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.score import EpisodeErrors, rmse
+from emb_daemon.offline.stretches import without_gaps
 
 #: Least number of episodes that tell effect from chance.
 EPISODES = 6
@@ -570,8 +571,7 @@ def _with_lasting(calibration: Calibration, selection: Selection) -> Calibration
     worst, noise = 0.0, calibration.noise
     for error, force in zip(bench.by_log(apart), bench.by_log(loads), strict=True):
         rows = np.flatnonzero(error)
-        cuts = np.flatnonzero(np.diff(rows) != 1) + 1
-        pairs = zip(np.split(error[rows], cuts), np.split(force[rows], cuts), strict=True)
+        pairs = zip(without_gaps(rows, error[rows]), without_gaps(rows, force[rows]), strict=True)
         worst = max(worst, lasting_share(pairs, calibration.stiffness.maximum_force_N))
     beyond = float(np.sqrt(max(worst**2 - noise.torque_relative**2, 0.0)))
     return moved(calibration, {"noise.torque_lasting": max(beyond, noise.torque_lasting)})

@@ -42,13 +42,11 @@ def _parse_payload(text, at, stop, octets):
 
 
 @njit
-def _parse_line(text, start, stop, frame, octets):
-    """Fill ``frame`` from ``text[start:stop]``, and ``octets`` with its payload if there is room; False if the line is
-    malformed."""
-    at = start
-    if text[at] != _OPEN:
-        return False
-    at += 1
+def _parse_time(text, start, stop):
+    """Place after ``(seconds.fraction)`` in ``text[start:stop]``, and the time in ns; place -1 if it is malformed."""
+    if text[start] != _OPEN:
+        return -1, np.int64(0)
+    at = start + 1
     whole, fraction, digits = np.int64(0), np.int64(0), 0
     while at < stop and _ZERO <= text[at] <= _NINE:
         whole = whole * 10 + (text[at] - _ZERO)
@@ -61,12 +59,21 @@ def _parse_line(text, start, stop, frame, octets):
                 digits += 1
             at += 1
     if at >= stop or text[at] != _CLOSE or digits == 0:
-        return False
+        return -1, np.int64(0)
     while digits < 9:
         fraction *= 10
         digits += 1
-    frame.time_ns = whole * 1_000_000_000 + fraction
-    at += 1
+    return at + 1, whole * 1_000_000_000 + fraction
+
+
+@njit
+def _parse_line(text, start, stop, frame, octets):
+    """Fill ``frame`` from ``text[start:stop]``, and ``octets`` with its payload if there is room; False if the line is
+    malformed."""
+    at, time_ns = _parse_time(text, start, stop)
+    if at < 0:
+        return False
+    frame.time_ns = time_ns
     if at >= stop or text[at] != _SPACE:
         return False
     at += 1

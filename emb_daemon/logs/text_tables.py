@@ -5,7 +5,9 @@ import csv
 import io
 import itertools
 import re
+from collections.abc import Iterator
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +67,6 @@ def some_of(wanted: str, names: list[str]) -> str:
 def read_text(path: Path, content: bytes, names: list[str]) -> Any:
     """A table (pyarrow) from text, as measurement tools write it: text before the header and units after it are skipped, rows
     with another number of cells (a truncated last one) left out, with a note on stderr."""
-    import pyarrow.csv
-
     content = _as_utf8(content, names)
     if b"\n" not in content:
         content = content.replace(b"\r", b"\n")
@@ -76,31 +76,9 @@ def read_text(path: Path, content: bytes, names: list[str]) -> Any:
     lines = [
         line.decode(errors="replace").rstrip("\r") for line in content.split(b"\n", PREAMBLE + _UNITS)[: PREAMBLE + _UNITS]
     ]
-    # The header is the line with most of the names, and the lines below it have its separator; before it is the tool's own
-    # text.
-    header, delimiter = max(
-        ((row, mark) for row in range(min(len(lines), PREAMBLE)) for mark in _DELIMITERS),
-        key=lambda at: (
-            len({*names} & {*_cells(lines[at[0]], at[1])}) * _parts(lines[at[0] + 1 : at[0] + 2 + _UNITS], at[1]),
-            -at[0],
-            at[1] != " ",
-            lines[at[0]].count(at[1]),
-        ),
-    )
+    header, delimiter = _find_header(lines, names)
     content = _under_one_header(path, content, header)
-    cells = _cells(lines[header], delimiter)
-    by_place = all(map(_BY_PLACE.fullmatch, names))
-    if not {*names} & {*cells} and (found := _without_header(lines, by_place)):
-        header, delimiter = found
-        above = _cells(lines[header], delimiter) if header >= 0 else []
-        cells = [f"column {number + 1}" for number in range(len(_cells(lines[header + 1], delimiter)))]
-        # By their names columns of times are known to be such.
-        if len(above) == len(cells) and not any(map(_is_number, above)):
-            cells = above
-    elif not {*names} & {*cells}:
-        # What is then said of the names is of what stands above the numbers.
-        header, delimiter = _above_numbers(lines) or (header, delimiter)
-        cells = _cells(lines[header], delimiter)
+    header, delimiter, cells = _find_names(lines, header, delimiter, names)
     if delimiter == " ":
         content = b"\n".join(b" ".join(line.split()) for line in content.split(b"\n"))
     rows = [_cells(line, delimiter) for line in lines[header + 1 : header + 1 + _UNITS]]
@@ -113,35 +91,18 @@ def read_text(path: Path, content: bytes, names: list[str]) -> Any:
     if _are_pairs(cells, rows[units:]):
         tell(f"{path}: a name stands over two columns, a time and its value: the value is taken; `column 1` is a time")
         cells = ["", *cells[:-1]]
-    odd = []
-
-    def leave_out(row) -> str:
-        odd.append(row)
-        return "skip"
-
-    def read(decimal_point: str):
-        odd.clear()
-        return pyarrow.csv.read_csv(
-            io.BytesIO(content),
-            # The handler is called from one thread only.
-            pyarrow.csv.ReadOptions(skip_rows=header + 1 + units, column_names=cells, use_threads=False),
-            pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=leave_out),
-            pyarrow.csv.ConvertOptions(decimal_point=decimal_point, null_values=_NOTHING, strings_can_be_null=True),
-        )
-
-    table = read(".")
+    parse = partial(_parse, content, header + 1 + units, delimiter)
+    table, odd = parse(cells, ".")
     reached = odd[0].actual_columns if len(odd) > table.num_rows else len(cells)
     if reached < len(cells) and {*names} <= {*cells[:reached]} | {f"column {n + 1}" for n in range(reached)}:
         more = ", ".join(filter(None, cells[reached:]))
         tell(f"{path}: rows have {reached} cells, the header {len(cells)}; its last name nothing: {more}")
         cells = cells[:reached]
-        table = read(".")
-    wanted = [table.column(place) for name in names if (place := place_of(name, table.column_names)) is not None]
-    texts = [column for column in wanted if pyarrow.types.is_string(column.type)]
+        table, odd = parse(cells, ".")
     # A comma that does not separate is decimal; it may occur for the first time after many rows.
-    commas = delimiter != "," and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for t in texts for cell in t.to_pylist() if cell)
+    commas = delimiter != "," and any(map(_DECIMAL_COMMA.fullmatch, _words(table, names)))
     if commas:
-        table = read(",")
+        table, odd = parse(cells, ",")
     if len(odd) > table.num_rows:
         raise InputError(
             f"{path}: {len(odd)} of {len(odd) + table.num_rows} rows have another number of cells than {len(cells)}, the "
@@ -149,8 +110,73 @@ def read_text(path: Path, content: bytes, names: list[str]) -> Any:
         )
     if odd:
         tell(f"{path}: {len(odd)} rows with another number of cells than {len(cells)} left out")
-    stated = [next(filter(None, map(known_as, column)), "") for column in itertools.zip_longest(*rows[:units], fillvalue="")]
-    marks = {DECIMAL: b","} if commas else {}
+    return _with_units(table, rows[:units], {DECIMAL: b","} if commas else {})
+
+
+def _find_header(lines: list[str], names: list[str]) -> tuple[int, str]:
+    """Row of the header, and its separator: the line with most of the names, below which lines have its separator. What stands
+    before it is the tool's own text."""
+    return max(
+        ((row, mark) for row in range(min(len(lines), PREAMBLE)) for mark in _DELIMITERS),
+        key=lambda at: (
+            len({*names} & {*_cells(lines[at[0]], at[1])}) * _parts(lines[at[0] + 1 : at[0] + 2 + _UNITS], at[1]),
+            -at[0],
+            at[1] != " ",
+            lines[at[0]].count(at[1]),
+        ),
+    )
+
+
+def _find_names(lines: list[str], header: int, delimiter: str, names: list[str]) -> tuple[int, str, list[str]]:
+    """(row after which the table begins, separator, names of the columns); where no header has any of the ``names``, places
+    stand for them, or what stands above the numbers is told."""
+    cells = _cells(lines[header], delimiter)
+    if {*names} & {*cells}:
+        return header, delimiter, cells
+    if not (found := _without_header(lines, all(map(_BY_PLACE.fullmatch, names)))):
+        header, delimiter = _above_numbers(lines) or (header, delimiter)
+        return header, delimiter, _cells(lines[header], delimiter)
+    header, delimiter = found
+    above = _cells(lines[header], delimiter) if header >= 0 else []
+    cells = [f"column {number + 1}" for number in range(len(_cells(lines[header + 1], delimiter)))]
+    # By their names columns of times are known to be such.
+    return header, delimiter, above if len(above) == len(cells) and not any(map(_is_number, above)) else cells
+
+
+def _parse(content: bytes, skipped: int, delimiter: str, cells: list[str], decimal_point: str) -> tuple[Any, list]:
+    """(table of the lines after those that are ``skipped``, rows with another number of cells, which it lacks)."""
+    import pyarrow.csv
+
+    odd = []
+
+    def leave_out(row) -> str:
+        odd.append(row)
+        return "skip"
+
+    table = pyarrow.csv.read_csv(
+        io.BytesIO(content),
+        # The handler is called from one thread only.
+        pyarrow.csv.ReadOptions(skip_rows=skipped, column_names=cells, use_threads=False),
+        pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=leave_out),
+        pyarrow.csv.ConvertOptions(decimal_point=decimal_point, null_values=_NOTHING, strings_can_be_null=True),
+    )
+    return table, odd
+
+
+def _words(table: Any, names: list[str]) -> Iterator[str]:
+    """Cells of the named columns that are text."""
+    import pyarrow
+
+    places = (place_of(name, table.column_names) for name in names)
+    columns = (table.column(place) for place in places if place is not None)
+    return (cell.strip() for text in columns if pyarrow.types.is_string(text.type) for cell in text.to_pylist() if cell)
+
+
+def _with_units(table: Any, above: list[list[str]], marks: dict) -> Any:
+    """The table with ``marks`` on its columns, and the unit that one of the rows ``above`` states of each."""
+    import pyarrow
+
+    stated = [next(filter(None, map(known_as, column)), "") for column in itertools.zip_longest(*above, fillvalue="")]
     fields = [
         field.with_metadata(marks | ({UNIT: unit} if unit else {}))
         for field, unit in itertools.zip_longest(table.schema, stated[: table.num_columns], fillvalue="")

@@ -12,6 +12,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.estimator.status import TABLE
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 from emb_daemon.offline.score import PATHS, figures, share_inside
+from emb_daemon.offline.stretches import stretches_of
 from emb_daemon.replay import Result
 from emb_daemon.report.figures import BAND, INK, MODEL, PALE, REFERENCE, Panel, Style, Trace, time_figure, xy_figure
 from emb_daemon.report.page import FAIL, PASS, Cell, Page
@@ -33,8 +34,8 @@ _REASON = Style("#b3261e", 7.0)
 
 def stretches(time_s: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Begin and end of each stretch in which ``active`` holds; those too close or short to be seen are joined and widened."""
-    edges = np.diff(np.concatenate([[False], active, [False]]).astype(np.int8))
-    begin, end = time_s[np.flatnonzero(edges == 1)], time_s[np.flatnonzero(edges == -1) - 1]
+    first, after = stretches_of(active).T
+    begin, end = time_s[first], time_s[after - 1]
     if not len(begin):
         return begin, end
     least = max(CYCLE_S, _VISIBLE * float(time_s[-1] - time_s[0]))

@@ -25,6 +25,7 @@ from emb_daemon.models.stiffness import travel_at
 from emb_daemon.offline import Log
 from emb_daemon.offline.levels import force_error_levels, integral_time, lasting_share
 from emb_daemon.offline.score import rmse
+from emb_daemon.offline.stretches import without_gaps
 from emb_daemon.report.page import Page
 from emb_daemon.wire.contract import CYCLE_S
 
@@ -236,7 +237,7 @@ def _more_current(held_out: list[Unexplained], hot: tuple[Unexplained, ...]) -> 
 
 def _lasting_A(left: Unexplained) -> float:
     """RMS of the means of an unexplained current over manoeuvres, A; NaN without one that long."""
-    return rmse(_means(_without_gaps(left, left.current_A)))
+    return rmse(_means(without_gaps(left.rows, left.current_A)))
 
 
 def _lasting(held_out: list[Unexplained], gear_gain: float, maximum_force_N: float) -> float:
@@ -245,14 +246,9 @@ def _lasting(held_out: list[Unexplained], gear_gain: float, maximum_force_N: flo
     for left in held_out:
         torque = left.found.values[TORQUE_CONSTANT] * left.current_A
         load = (gear_gain + left.found.values[LOAD_FRICTION] * left.friction_mean) * left.force_N
-        pairs = zip(_without_gaps(left, torque), _without_gaps(left, load), strict=True)
+        pairs = zip(without_gaps(left.rows, torque), without_gaps(left.rows, load), strict=True)
         shares.append(lasting_share(pairs, gear_gain * maximum_force_N))
     return max(shares)
-
-
-def _without_gaps(left: Unexplained, values: np.ndarray) -> list[np.ndarray]:
-    """Stretches of ``values``, one for each of ``rows``, in neighbouring cycles."""
-    return np.split(values, np.flatnonzero(np.diff(left.rows) != 1) + 1)
 
 
 def _means(series: list[np.ndarray]) -> np.ndarray:
@@ -281,7 +277,7 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
         values = left.found.values
         current, mean, force = left.current_A, left.friction_mean, left.force_N
         torque = values[TORQUE_CONSTANT] * current
-        series += _without_gaps(left, left.current_A)
+        series += without_gaps(left.rows, left.current_A)
         sliding = 1.0 - mean**2
         turning.append((sliding * (values[OFFSET_FRICTION] + values[LOAD_FRICTION] * np.maximum(force, 0.0))) ** 2)
         excess.append(torque**2 - np.mean(torque[sliding < _SLID] ** 2))

@@ -15,6 +15,7 @@ from emb_daemon.offline.fit import left_out_covariance, valley
 from emb_daemon.offline.recording import Recording, simulate
 from emb_daemon.offline.run import stiffness_force
 from emb_daemon.offline.score import rmse
+from emb_daemon.offline.stretches import stretches_of
 from emb_daemon.report.figures import MODEL, Panel, Style, Trace, xy_figure
 from emb_daemon.report.page import Section
 
@@ -116,9 +117,8 @@ def find_bursts(log: Log) -> list[slice]:
     """Stretches of full-rate clamping at standstill with a reference force."""
     samples = log.samples
     fast = samples["dt"] <= _SLOWEST_SAMPLE_S
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], fast, [False]]).astype(np.int8)))
     found = []
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, end in stretches_of(fast):
         rows = slice(max(start - 1, 0), end)
         force = log.force_N[rows]
         long = log.time_s[rows.stop - 1] - log.time_s[rows.start] >= _LEAST_BURST_S
