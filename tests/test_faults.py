@@ -8,13 +8,14 @@ from test_pipeline import _run, _sliding, car  # noqa: F401
 from wirekit import MS
 
 from emb_daemon.estimator.records import SAMPLE
+from emb_daemon.offline.score import rmse
 from emb_daemon.pipeline import Pipeline
 from emb_daemon.wire import contract as r
 from emb_daemon.wire.contract import CYCLE_NS
 
 #: Cycles before the fault, in it, and after it; the last E2E error is shown for a second.
 _BEFORE, _DURING, _AFTER = 150, 100, 300
-#: Cycles of silence for which the last force is a prediction.
+#: Cycles of silence for which there is a prediction.
 _PREDICTED_CYCLES = 25
 
 
@@ -98,6 +99,16 @@ def test_resolver_cut(car, good):  # noqa: F811
             known = cycle - _BEFORE + 1 <= _PREDICTED_CYCLES
             assert (signals["Status"], signals["ForceSource"]) == ((1, 3) if known else (2, 15))
             assert signals["InputAge"] == min(4 * (cycle - _BEFORE + 1), 255)
+
+
+def test_a_motor_of_which_nothing_is_heard_goes_on_for_a_while(car, good):  # noqa: F811
+    """Three to eight cycles after the last sample of a stroke the force is nearer to what it would be than to what it was."""
+    cycles = np.arange(_BEFORE + 2, _BEFORE + 8)
+    estimates, _ = _fault(car, _drop(0x100))
+    predicted, expected = (np.array([_at(rows, cycle)["force"] for cycle in cycles]) for rows in (estimates, good))
+    last = _at(good, _BEFORE - 1)["force"]
+    assert rmse(last - expected) > 200.0
+    assert rmse(predicted - expected) < 0.4 * rmse(last - expected)
 
 
 def test_everything_cut_in_the_clearance_grows_uncertain_too(car):  # noqa: F811

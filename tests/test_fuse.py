@@ -10,9 +10,11 @@ from emb_daemon.estimator import fuse, resolver, straying
 from emb_daemon.estimator.hypotheses import TORQUE_JUMP
 from emb_daemon.estimator.paths import FLICKER_RAD, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
-from emb_daemon.estimator.step import _gained_since, step
+from emb_daemon.estimator.step import _gained_since, predict, step
 from emb_daemon.models.fusion import OF_THE_MODEL
 from emb_daemon.models.lateness import remember
+from emb_daemon.models.plausibility import STIFFNESS_WRONG
+from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import CYCLE_S
@@ -130,6 +132,32 @@ def test_a_force_that_comes_a_cycle_late_is_as_sure_as_the_motor_was_slow(p, s):
     s["speed"], s["factor"], s["scale"], s["past_contact"] = 0.0, 1.0, 1.0, 10.0
     assert _gained_since(s, p, CYCLE_S) == 0.0
     assert _gained_since(s, p, 2.0 * CYCLE_S) > 900.0 * 40.0 * 2.0 * CYCLE_S
+
+
+@pytest.mark.parametrize(
+    ("change", "held"),
+    [({}, False), ({"speed": 2.0}, True), ({"unknown": True}, True), ({"verdict": STIFFNESS_WRONG}, True)],
+    ids=["turns", "stands", "contact unknown", "resolver implausible"],
+)
+def test_a_prediction_goes_on_with_a_motor_whose_angle_tells_the_force(p, s, change, held):
+    """For 32 ms: what it does then is as likely the opposite. Sigma is the same, as of any motion."""
+    out = np.zeros(1, ESTIMATE)[0]
+    s["factor"], s["scale"], s["past_contact"], s["started"], s["fused"], s["drive"] = 1.0, 1.0, 10.0, True, 8000.0, 8000.0
+    for name, value in change.items():
+        (s["plausibility"] if name == "verdict" else s)[name] = value
+    forces = []
+    for age in (0.012, 0.032, 0.08):
+        predict(s, p, age, out)
+        forces.append(float(out["force"]))
+        assert out["sigma"] > 40.0 * 900.0 * age
+    if held:
+        assert forces == [8000.0] * 3
+    else:
+        there, _ = characteristic_curve(10.0 + 1.3 * 40.0 * 0.032, p["curve"])
+        here, _ = characteristic_curve(10.0, p["curve"])
+        settled = 8000.0 + there - here
+        assert 8000.0 < forces[0] < forces[1] < forces[2] < settled
+        assert settled - forces[2] == pytest.approx((there - here) * p["relaxation_time"] / 0.08, rel=0.2)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.008])
