@@ -14,7 +14,7 @@ from wirekit import MS, frame, record
 from emb_daemon.errors import InputError, InputErrors
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
-from emb_daemon.wire.contract import MODES, REASONS, REQUESTS, RESULTS, reason_words
+from emb_daemon.wire.contract import CYCLE_NS, MODES, REASONS, REQUESTS, RESULTS, reason_words
 from emb_daemon.wire.e2e import crc, protect
 from emb_daemon.wire.frames import ERROR, EXTENDED, FD, REMOTE, row_of
 from emb_daemon.wire.layout import CORNERS, _restrict, default_layout, load_layout, pack, unpack
@@ -27,6 +27,7 @@ from emb_daemon.wire.receive import (
     BAD_STATUS,
     IGNORED,
     SECOND_SENDER,
+    lateness,
     new_reception,
     receive,
 )
@@ -372,6 +373,26 @@ def test_a_frame_is_half_a_cycle_early_at_most_at_any_time(early_ms):
         assert _receive(_resolver(cycle % 15, begin_ns + 4 * MS * cycle), receptions)[1] == ACCEPTED
     verdict = _receive(_resolver(0, begin_ns + 1200 * MS - round(early_ms * MS)), receptions)[1]
     assert verdict == (ACCEPTED if early_ms < 2.0 else BAD_COUNTER)
+
+
+@pytest.mark.parametrize("shown", [40, 300], ids=["before a window is full", "after it"])
+def test_a_frame_is_as_late_as_it_comes_after_the_promptest(shown):
+    """Also if the first of all was late; and after a silence, of which the schedule knows no whole turns of the counter."""
+    receptions, begin_ns = new_reception(), 3 * 10**17
+
+    def late_ms(cycle, by_ms):
+        time_ns = begin_ns + 4 * MS * cycle + round(by_ms * MS)
+        assert _receive(_resolver(cycle % 15, time_ns), receptions)[1] == ACCEPTED
+        return lateness(receptions[wire.RESOLVER], CYCLE_NS) / MS
+
+    late_ms(0, 8.0)
+    for cycle in range(1, shown):
+        assert late_ms(cycle, 0.0) == 0.0
+    assert late_ms(shown, 9.0) == pytest.approx(9.0)
+    assert late_ms(shown + 1, 5.0) == pytest.approx(5.0)
+    assert late_ms(shown + 32, 0.0) == 0.0
+    assert late_ms(shown + 64, -1.0) == 0.0
+    assert late_ms(shown + 96, 8.0) == pytest.approx(8.0)
 
 
 def test_of_can_fd_the_first_eight_bytes_are_kept():
