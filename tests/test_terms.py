@@ -157,6 +157,11 @@ def test_memories_lag_slip_and_respond():
     np.testing.assert_allclose(lag, 0.5 * (1.0 - np.exp(-(passed + DT) / 2.0)), rtol=1e-9)
     deficit = over(Term(**base, memory="deficit", memory_scale=2.0, low=0.0, high=1.0), x)[10:]
     np.testing.assert_allclose(deficit, lag - 0.5, rtol=1e-9)
+    # A rise at once, as long as it is one; what is past is forgotten like any lag.
+    there_and_back = np.where(np.arange(2000) < 1000, x, 0.0)
+    peak = over(Term(**base, memory="peak", memory_scale=2.0, low=0.0, high=1.0), there_and_back)
+    np.testing.assert_array_equal(peak[:1000], 0.5 * x[:1000])
+    np.testing.assert_allclose(peak[1000:], 0.5 * np.exp(-DT * np.arange(1, 1001) / 2.0), rtol=1e-9)
     # Heat follows the square of what makes it, whichever way that turns.
     there_and_back = np.where(np.arange(2000) % 2, 1.0, -1.0)
     shape = base | {"shape": "even_power", "exponent": 2.0, "scale": 2.0, "low": -1.0, "high": 1.0, "memory_scale": 2.0}
@@ -438,6 +443,8 @@ _EXPORTED = (
     Term(name="term:x4", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
          coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0,
          other="clamp_force", other_high=8e3),
+    Term(name="term:x6", port="stiffness", signal="motor_speed", memory="peak", shape="odd_power", coefficient=0.05,
+         scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0),
     Term(name="term:x5", port="gear_friction", signal="clamp_force", shape="odd_power", coefficient=0.1, scale=2e4, low=0.0,
          high=2e4, other="motor_speed", other_high=5.0),
 )  # fmt: skip

@@ -57,7 +57,8 @@ class Term(Struct, kw_only=True):
     #: none: z is the signal; lag: z is the signal through a first-order lag of time constant memory_scale, s; deficit: z is
     #: that lag's output minus the signal; slip: z is the state, -1 to 1, of a Maxwell slip element of stretch memory_scale, in
     #: the signal's unit; response: z is the signal, and the lag acts on the output of the shape, as heat follows the power
-    #: that makes it.
+    #: that makes it; peak: z is the lag's output, but follows a rise at once, as what a material remembers of its largest
+    #: strain.
     memory: _Memory = "none"
     #: constant: 1; odd_power: sign(u)|u|^exponent; even_power: |u|^exponent; saturation: u/(1 + |u|); decay: exp(−|u|); onset:
     #: max(u, 0); harmonic: coefficient cos u + sine sin u; bump: exp(−u²).

@@ -42,6 +42,7 @@ _MEMORIES = {
 """,
 }
 _MEMORIES["deficit"] = _MEMORIES["lag"]
+_MEMORIES["peak"] = f"{_MEMORIES['lag']}    s.memory = max(s.memory, x)\n"
 #: Memory that acts after the shape instead of before it.
 _RESPONSE = """    y = {shaped}
     if not s.begun:
