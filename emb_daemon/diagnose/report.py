@@ -76,6 +76,7 @@ def _left(left: Left) -> dict:
         "unit": UNITS[left.channel],
         "rms": left.rms,
         "log": left.log or None,
+        "time_s": left.time_s,
         "achieved_by_calibration": left.achieved if np.isfinite(left.achieved) else None,
         "share": left.share,
         "dependences": [

@@ -234,12 +234,15 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
     left = diagnosis.unexplained
     if left is None:
         return []
-    unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.log}" if left.log else ""
+    unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.place}" if left.log else ""
     if left.beyond:
         size = f"{left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}"
         text = f"Not explained by any known effect: {size}, where {left.achieved:.3g} {unit} are {least_left(diagnosis)}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
+    if strongest is None and left.time_s is not None:
+        told = f"{text}. What would tell: more manoeuvres like that one in the logs that are fitted."
+        return [told, *_withdrawn(diagnosis, left.channel)]
     if strongest is None:
         return [f"{text}, which depend on no signal that was recorded.", *_withdrawn(diagnosis, left.channel)]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
