@@ -118,7 +118,7 @@ def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibrati
     assert rmse(np.array(each)) < 1.5 * left.achieved < each[-1]
 
 
-@pytest.mark.parametrize(("off_N", "seconds", "said"), [(95.0, 4.0, True), (85.0, 4.0, False), (95.0, 0.02, False)])
+@pytest.mark.parametrize(("off_N", "seconds", "said"), [(95.0, 8.0, True), (85.0, 8.0, False), (95.0, 0.02, False)])
 def test_what_is_left_in_one_stop_of_forty_is_said_where_it_is_beyond_chance_and_matters(off_N, seconds, said):
     """A term that holds on the stops that were fitted, and not on the one that is hotter."""
     count, length = 40, 2000

@@ -443,8 +443,8 @@ _EXPORTED = (
     Term(name="term:x4", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
          coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0,
          other="clamp_force", other_high=8e3),
-    Term(name="term:x6", port="stiffness", signal="motor_speed", memory="peak", shape="odd_power", coefficient=0.05,
-         scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0),
+    Term(name="term:x6", port="stiffness", signal="clamp_force", memory="peak", shape="odd_power", coefficient=0.05,
+         scale=2e4, exponent=1.5, memory_scale=0.4, low=0.0, high=2e4),
     Term(name="term:x5", port="gear_friction", signal="clamp_force", shape="odd_power", coefficient=0.1, scale=2e4, low=0.0,
          high=2e4, other="motor_speed", other_high=5.0),
 )  # fmt: skip
