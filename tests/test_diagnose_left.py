@@ -150,6 +150,31 @@ def test_what_is_left_in_one_stop_of_forty_is_said_where_it_is_beyond_chance_and
         assert left.beyond and "on one.log at 140 s" in told and "energy" not in told
 
 
+@pytest.mark.parametrize(
+    ("made", "left_N", "said"), [(True, 26.0, True), (True, 21.0, False), (True, 26.0 / 3.0, False), (False, 26.0, False)]
+)
+def test_a_term_that_leaves_clearly_more_of_other_logs_than_of_the_fitted_ones_is_said(made, left_N, said):
+    """Its shape is a guess beyond them. Logs in which nothing was found differ as the calibration's own do."""
+    episode = np.repeat(np.arange(4), 100)
+    own_N = left_N / 26.0 * 15.0 if left_N < 15.0 else 15.0
+    bench = SimpleNamespace(
+        has_reference=True, trials=[SimpleNamespace(force_N=np.full(400, 5e3))],
+        means=lambda channel, samples: Averaging(episode, samples),
+    )  # fmt: skip
+    selection = SimpleNamespace(
+        accepted=("any",), candidates={"any": SimpleNamespace(made=made)}, channel_of=lambda name: "stiffness",
+        model=SimpleNamespace(bench=bench, residual={"stiffness": np.full(400, own_N)}),
+        screening=SimpleNamespace(floor=lambda *_: 10.0, achieved=lambda *_: 40.0),
+    )  # fmt: skip
+    fitted = diagnosis._left_of_fitted(selection, "stiffness", left_N, 44.0)
+    left = Left("stiffness", left_N, 44.0, 0.25, (Dependence("stiffness", "energy", 0.1, 4.0, 1.0, False),), fitted=fitted)
+    assert left.present is said
+    if said:
+        bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=object()))
+        [told] = _unexplained(SimpleNamespace(unexplained=left, bench=bench, findings=(), withdrawn=()))
+        assert "26 N RMS" in told and "16.5 N are left of the logs in which" in told and "energy" not in told
+
+
 def test_what_lasts_of_a_torque_is_that_of_sliding_friction(calibration):
     """How friction turns over is within the calibration's noise; errors while it slides count in full."""
     bench = Bench([log_of(next(drives(calibration, 54, {}, stops=3)))], calibration)

@@ -461,8 +461,25 @@ def _left(
         found = [*withdrawn, *(d for d in found if d.signal not in {w.signal for w in withdrawn})]
         found.sort(key=lambda dependence: -dependence.share)
         share = (last / first) ** 2 if first > 0.0 else 0.0
-        result[channel] = Left(channel, last, known, share, tuple(found), log, time_s)
+        fitted = float("nan") if log or judging is model.bench else _left_of_fitted(selection, channel, last, known)
+        result[channel] = Left(channel, last, known, share, tuple(found), log, time_s, fitted)
     return result
+
+
+def _left_of_fitted(selection: Selection, channel: str, rms: float, known: float) -> float:
+    """What lasts of a channel on the fitted logs (RMS) by the forces of the judging ones, of which the calibration achieves
+    ``known``, where ``rms`` is left of these; NaN where no term was made, or the difference does not matter.
+
+    A term's shape is a guess beyond what was fitted. What no term was made for differs from log to log as the calibration's
+    own figures do, and is held against these alone."""
+    model, screening = selection.model, selection.screening
+    made = [name for name in selection.accepted if selection.candidates[name].made and selection.channel_of(name) == channel]
+    if not made or channel not in FORCE_CHANNELS or not model.bench.has_reference:
+        return float("nan")
+    samples = LASTING[channel]
+    own = screening.achieved(model, channel, _force_of(model.bench), np.zeros(0), samples)
+    left = rms_known(model.residual[channel], model.bench.means(channel, samples)) * known / own
+    return left if rms**2 - left**2 >= screening.floor(model, channel) ** 2 else float("nan")
 
 
 def _by_log(

@@ -8,6 +8,7 @@ from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.signals import MANOEUVRES
+from emb_daemon.diagnose.unexplained import is_beyond
 from emb_daemon.effects.terms import SIGNALS
 
 #: Where a term acts, for people.
@@ -237,11 +238,14 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
     unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.place}" if left.log else ""
     if left.beyond:
         size = f"{left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}"
-        text = f"Not explained by any known effect: {size}, where {left.achieved:.3g} {unit} are {least_left(diagnosis)}"
+        known = f"{left.achieved:.3g} {unit} are {least_left(diagnosis)}"
+        if not is_beyond(left.rms, left.achieved):
+            known = f"{left.fitted:.3g} {unit} are left of the logs in which a term was made for it"
+        text = f"Not explained by any known effect: {size}, where {known}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
-    if strongest is None and left.time_s is not None:
-        told = f"{text}. What would tell: more manoeuvres like that one in the logs that are fitted."
+    if strongest is None and left.elsewhere:
+        told = f"{text}. What would tell: more such manoeuvres in the logs that are fitted."
         return [told, *_withdrawn(diagnosis, left.channel)]
     if strongest is None:
         return [f"{text}, which depend on no signal that was recorded.", *_withdrawn(diagnosis, left.channel)]

@@ -77,6 +77,8 @@ class Left:
         share: of the mean square there was before, that is left.
         dependences: on signals, strongest first.
         log: the only one on which so much is left, if it is not all.
+        fitted: where a term was made that does not carry over whole, what it leaves of the fitted logs, by the forces of
+            these; else NaN.
         time_s: on that log, at the middle of the only episode in which so much is left, if it is not all of the log.
     """
 
@@ -87,11 +89,12 @@ class Left:
     dependences: tuple[Dependence, ...]
     log: str = ""
     time_s: float | None = None
+    fitted: float = float("nan")
 
     @property
     def beyond(self) -> bool:
-        """Whether the residual is clearly above what the calibration achieved."""
-        return is_beyond(self.rms, self.achieved)
+        """Whether the residual is clearly above what the calibration achieved, or what a term leaves of the fitted logs."""
+        return is_beyond(self.rms, self.achieved) or is_beyond(self.rms, self.fitted)
 
     @property
     def present(self) -> bool:
@@ -100,9 +103,14 @@ class Left:
     @property
     def strongest(self) -> Dependence | None:
         """What the residual depends on most: surely, or else by a share that is worth a word; none where no signal tells, or
-        where it is left in one episode."""
-        worth = (d for d in self.dependences if d.share >= _LEAST_SHARE and self.time_s is None)
+        where it is left `elsewhere`."""
+        worth = (d for d in self.dependences if d.share >= _LEAST_SHARE and not self.elsewhere)
         return next(iter([*(d for d in self.dependences if d.matters), *worth]), None)
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether it is left where the fitted logs, of which the dependences are, do not tell."""
+        return self.time_s is not None or (not is_beyond(self.rms, self.achieved) and is_beyond(self.rms, self.fitted))
 
     @property
     def place(self) -> str:
