@@ -165,7 +165,7 @@ def _outside(diagnosis: Diagnosis) -> list[str]:
         told.append(
             f"In {100.0 * share:.0f} % of the validation logs' samples {in_words(signal)} is outside the range in which "
             f"{name} was found (there {reached[0]:.3g} to {reached[1]:.3g} {unit}, the range {least}{high:.3g} {unit}): "
-            "the term keeps the value of its edge."
+            "there the term is a guess."
         )
     return told
 

@@ -59,6 +59,10 @@ _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
 (_THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE, _TORQUE_CONSTANT, _TORQUE, _GEAR_GAIN, _GEAR_FRICTION, _PAD_FRICTION,
  _AMPERE, _RELAXATION, _SHARE, _CONTACT, _GAP, _THROUGH, _COOLING, _PAD_HEAT, _DISC_HEAT) = range(len(PORTS))  # fmt: skip
 
+#: Widths of its range by which a term goes on beyond it as it is shaped, before it is held: of terms of drawn brakes whose
+#: second drive was hotter or harder, a constant left two to four times as much as was left within the range.
+BEYOND = 0.25
+
 #: Clamp force from which the brake counts as clamped, N.
 CLAMPED_N = 150.0
 
@@ -180,14 +184,16 @@ def _of_other(q, signal):
 
 @njit
 def _value(q, t, k, dt, maximum_force):
-    """Amount that term ``k`` adds at its port, in the port's unit; outside its range the amount at the edge."""
+    """Amount that term ``k`` adds at its port, in the port's unit; outside its range as shaped for `BEYOND` of its width, then
+    held, and never beyond its limits."""
     x, share = t.signal[q.signal], 1.0
     if q.other >= 0:
         share = _of_other(q, t.signal)
     if not (np.isfinite(x) and np.isfinite(share)):
         return 0.0
-    share = min(max(share, 0.0), 1.0)
-    x = min(max(x, q.low), q.high)
+    share = min(max(share, 0.0), 1.0 + BEYOND)
+    further = BEYOND * (q.high - q.low)
+    x = min(max(x, q.low - further), q.high + further)
     if q.memory == _RESPONSE:
         shaped = _remember(q, t, k, share * _shape(q, x), dt)
     else:
