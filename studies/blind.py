@@ -52,11 +52,14 @@ _FOREIGN = {
     "spindle_lead_error": {"amplitude_um": 15.0, "order_per_turn": 0.4, "phase_rad": 1.0},
     "drawn_pad_friction": {"size": -0.35, "signal": 9.0, "shape": SATURATION, "other": -1.0},
 }
+#: A later one, whose state no signal has: its seeds follow a range of their own.
+_REMEMBERING = "fastest_closing"
 _SAME = {
     "clamp_creep": {"term:force:clamp_force", "third_relaxation"},
     "brake_torque_coupling": {"term:stiffness:brake_torque"},
     "spindle_lead_error": {"term:motor_angle:motor_angle"},
     "drawn_pad_friction": {"term:pad_friction:friction_power"},
+    _REMEMBERING: {"term:stiffness:motor_speed"},
 }
 #: Signals of the family from which a seed draws effects, by port; the exponent is between these, every third has a second
 #: signal that multiplies, every third a lag (s) between these.
@@ -253,6 +256,13 @@ def draw_foreign(rng: np.random.Generator, family: Mapping[str, tuple[str, ...]]
     return {f"drawn_{port}": values}
 
 
+def draw_remembering(rng: np.random.Generator) -> dict[str, float]:
+    """How pads become stiffer, or softer, by the fastest closing, of some hundred newtons."""
+    share = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.04))
+    recovery_s = float(np.exp(rng.uniform(*np.log((5.0, 300.0)))))
+    return {"share": share, "exponent": float(rng.uniform(0.6, 2.0)), "recovery_s": recovery_s}
+
+
 def draw_sized(
     base: np.void,
     schedule: Schedule,
@@ -353,6 +363,8 @@ def _draw_hidden(
     if kind in ("drawn", "heat"):
         family = _FAMILY if kind == "drawn" else _HEAT_FAMILY
         return draw_sized(base, schedule, start, np.random.default_rng(seed), size, seed, family)
+    if names == (_REMEMBERING,):
+        return {_REMEMBERING: draw_remembering(np.random.default_rng(seed))}
     if kind == "foreign":
         return {names[0]: dict(_FOREIGN[names[0]])}
     hidden: dict[str, dict[str, float]] = {}
@@ -491,7 +503,8 @@ def plan(
     trials += [(60000 + 10 * k, "drawn", (), SIZES_N[1 + k % 3]) for k in range(drawn)]
     trials += [(80000 + 10 * k, "heat", (), SIZES_K[k % 2]) for k in range(heat)]
     strangers = [name for _ in range(foreign) for name in _FOREIGN]
-    return trials + [(50000 + 10 * k, "foreign", (name,), 0.0) for k, name in enumerate(strangers)]
+    trials += [(50000 + 10 * k, "foreign", (name,), 0.0) for k, name in enumerate(strangers)]
+    return trials + [(55000 + 10 * k, "foreign", (_REMEMBERING,), 0.0) for k in range(foreign)]
 
 
 def summary(trials: list[Trial]) -> str:

@@ -21,7 +21,7 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.selection import Selection
 from emb_daemon.diagnose.signals import MANOEUVRES, smooth_basis
-from emb_daemon.diagnose.text import least_left, verdict
+from emb_daemon.diagnose.text import _unexplained, least_left, verdict
 from emb_daemon.diagnose.unexplained import Dependence, Left, achieved, noise_of_means
 from emb_daemon.effects.stribeck_friction import EFFECT
 from emb_daemon.effects.terms import SIGNALS
@@ -116,6 +116,63 @@ def test_torque_that_nothing_explains_is_said_and_stated_to_the_filter(calibrati
     number = np.concatenate([np.full(len(trial.episode), trial.index) for trial in result.judges.trials])
     each = [rms_known(np.where(number == own, residual, 0.0), means) for own in range(number[-1] + 1)]
     assert rmse(np.array(each)) < 1.5 * left.achieved < each[-1]
+
+
+@pytest.mark.parametrize(("off_N", "seconds", "said"), [(95.0, 8.0, True), (85.0, 8.0, False), (95.0, 0.02, False)])
+def test_what_is_left_in_one_stop_of_forty_is_said_where_it_is_beyond_chance_and_matters(off_N, seconds, said):
+    """A term that holds on the stops that were fitted, and not on the one that is hotter."""
+    count, length = 40, 2000
+    episode, time_s = np.repeat(np.arange(count), length), CYCLE_S * np.arange(count * length)
+    noise = np.random.default_rng(3).normal(0.0, 20.0, count * length)
+    stop = (episode == 17) & (np.arange(len(episode)) % length < seconds / CYCLE_S)
+    after = np.where((episode == 17) & ~stop, 0.0, noise + off_N * stop)
+    trials = [
+        SimpleNamespace(episode=part, force_N=np.full(len(part), 5e3), log=SimpleNamespace(time_s=time))
+        for part, time in zip(np.split(episode, 2), (time_s[: len(time_s) // 2],) * 2, strict=True)
+    ]
+    bench = SimpleNamespace(
+        has_reference=True, own_data=False, episode={"stiffness": episode}, episodes=count, trials=trials,
+        sources=["one.log", "other.log"], means=lambda channel, samples: Averaging(episode, samples),
+    )  # fmt: skip
+    screening = SimpleNamespace(floor=lambda *_: 10.0, achieved=lambda *_: 40.0)
+    found = diagnosis._in_one_episode(SimpleNamespace(screening=screening, model=None), bench, 2.0 * after, after)
+    assert (found is not None) is said
+    assert rms_known(after, bench.means("stiffness", LASTING["stiffness"])) < 40.0
+    if found:
+        first, last, known, log, at_s = found
+        assert (
+            (known, log) == (40.0, "one.log") and first == pytest.approx(2.0 * last) and last == pytest.approx(off_N, rel=0.02)
+        )
+        assert at_s == pytest.approx(17.5 * length * CYCLE_S, rel=1e-3)
+        left = Left("stiffness", last, known, 0.25, (Dependence("stiffness", "energy", 0.1, 4.0, 1.0, False),), log, at_s)
+        bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=object()))
+        [told] = _unexplained(SimpleNamespace(unexplained=left, bench=bench, findings=(), withdrawn=()))
+        assert left.beyond and "on one.log at 140 s" in told and "energy" not in told
+
+
+@pytest.mark.parametrize(
+    ("made", "left_N", "said"), [(True, 26.0, True), (True, 21.0, False), (True, 26.0 / 3.0, False), (False, 26.0, False)]
+)
+def test_a_term_that_leaves_clearly_more_of_other_logs_than_of_the_fitted_ones_is_said(made, left_N, said):
+    """Its shape is a guess beyond them. Logs in which nothing was found differ as the calibration's own do."""
+    episode = np.repeat(np.arange(4), 100)
+    own_N = left_N / 26.0 * 15.0 if left_N < 15.0 else 15.0
+    bench = SimpleNamespace(
+        has_reference=True, trials=[SimpleNamespace(force_N=np.full(400, 5e3))],
+        means=lambda channel, samples: Averaging(episode, samples),
+    )  # fmt: skip
+    selection = SimpleNamespace(
+        accepted=("any",), candidates={"any": SimpleNamespace(made=made)}, channel_of=lambda name: "stiffness",
+        model=SimpleNamespace(bench=bench, residual={"stiffness": np.full(400, own_N)}),
+        screening=SimpleNamespace(floor=lambda *_: 10.0, achieved=lambda *_: 40.0),
+    )  # fmt: skip
+    fitted = diagnosis._left_of_fitted(selection, "stiffness", left_N, 44.0)
+    left = Left("stiffness", left_N, 44.0, 0.25, (Dependence("stiffness", "energy", 0.1, 4.0, 1.0, False),), fitted=fitted)
+    assert left.present is said
+    if said:
+        bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=object()))
+        [told] = _unexplained(SimpleNamespace(unexplained=left, bench=bench, findings=(), withdrawn=()))
+        assert "26 N RMS" in told and "16.5 N are left of the logs in which" in told and "energy" not in told
 
 
 def test_what_lasts_of_a_torque_is_that_of_sliding_friction(calibration):

@@ -18,7 +18,7 @@ from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.diagnosis import diagnose, with_terms
 from emb_daemon.diagnose.evidence import Averaging, Evidence
-from emb_daemon.diagnose.forms import enumerate_forms, harmonic, made_effect
+from emb_daemon.diagnose.forms import enumerate_forms, enumerate_products, harmonic, made_effect
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.page import page
 from emb_daemon.diagnose.prospects import Prospect, Search
@@ -99,6 +99,25 @@ def test_what_friction_does_as_it_turns_over_makes_no_term(calibration):
     braking = [f for f in search.forms if f.port == "gear_friction" and f.signal in ("brake_torque", "time_clamped")]
     gains = search._find_gains(braking)
     assert model.rms(gains.max(), "torque") < 0.5 * Screening(bench, start).floor(model, "torque", made=True)
+
+
+@pytest.mark.trial
+def test_pads_that_remember_how_fast_they_were_closed_are_seen_as_that(calibration):
+    """A hidden state that no signal has: the largest of one, forgotten in half a minute."""
+    hidden = {"share": 0.03, "exponent": 1.3, "recovery_s": 30.0}
+    frames = next(drives(calibration, 36, {"fastest_closing": hidden}, stops=12, drive=campaign))
+    model = Model.of(Bench([log_of(frames)], calibration)).refined(["stiffness"])
+    best = Search(model, "stiffness", grammar._signals(model)).prospects()[0]
+    assert best.means == ("stiffness", "motor_speed") and best.form.memory == "peak"
+    # What is seen is how fast the power of the state falls.
+    assert best.form.exponent / best.form.memory_scale == pytest.approx(1.3 / 30.0, rel=0.4)
+
+
+def test_a_motion_is_no_state_of_pads_but_the_fastest_of_late_is():
+    """A stiffness that followed the speed itself would be a source of energy."""
+    forms = enumerate_forms({"motor_speed": (-200.0, 200.0)}, ("stiffness", "thickness"))
+    assert {form.memory for form in forms} == {"peak"} and {form.port for form in forms} == {"stiffness", "thickness"}
+    assert not enumerate_products({"motor_speed": (-200.0, 200.0), "disc_speed": (0.0, 50.0)}, ("stiffness",))
 
 
 @pytest.mark.trial

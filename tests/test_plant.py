@@ -53,6 +53,7 @@ VISIBLE = {
     "caliper_softening": {"per_K": 0.01},
     "spindle_lead_error": {"amplitude_um": 10.0, "order_per_turn": 0.3},
     "cold_grease": {"per_K": 0.05},
+    "fastest_closing": {"share": 0.03, "exponent": 1.0, "recovery_s": 20.0},
     "current_delay": {"delay_s": 0.004 / 3.0},
     "drawn_stiffness": {"size": 0.05, "signal": 0, "exponent": 0.7, "other": -1, "lag_s": 2.0},
     "drawn_thickness": {"size": 10.0, "signal": 1, "exponent": 1.5, "other": -1},

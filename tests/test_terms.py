@@ -132,10 +132,10 @@ def test_shapes_are_what_they_are_called(shape, scale, centre, exponent):
     x = np.linspace(-60.0, 60.0, 41)
     term = Term(
         name="term:x", port="force", signal="motor_speed", shape=shape, coefficient=7.0, scale=scale, centre=centre,
-        exponent=exponent, low=-50.0, high=50.0,
+        exponent=exponent, low=-10.0, high=30.0,
     )  # fmt: skip
-    # Outside of its range a term stays what it is at the edge.
-    u = (np.clip(x, -50.0, 50.0) - centre) / scale
+    # Outside of its range a term goes on for a quarter of its width, and then stays.
+    u = (np.clip(x, -20.0, 40.0) - centre) / scale
     np.testing.assert_allclose(over(term, x), 7.0 * _SHAPES[shape](u, exponent), rtol=1e-12, atol=1e-12)
 
 
@@ -157,6 +157,11 @@ def test_memories_lag_slip_and_respond():
     np.testing.assert_allclose(lag, 0.5 * (1.0 - np.exp(-(passed + DT) / 2.0)), rtol=1e-9)
     deficit = over(Term(**base, memory="deficit", memory_scale=2.0, low=0.0, high=1.0), x)[10:]
     np.testing.assert_allclose(deficit, lag - 0.5, rtol=1e-9)
+    # A rise at once, as long as it is one; what is past is forgotten like any lag.
+    there_and_back = np.where(np.arange(2000) < 1000, x, 0.0)
+    peak = over(Term(**base, memory="peak", memory_scale=2.0, low=0.0, high=1.0), there_and_back)
+    np.testing.assert_array_equal(peak[:1000], 0.5 * x[:1000])
+    np.testing.assert_allclose(peak[1000:], 0.5 * np.exp(-DT * np.arange(1, 1001) / 2.0), rtol=1e-9)
     # Heat follows the square of what makes it, whichever way that turns.
     there_and_back = np.where(np.arange(2000) % 2, 1.0, -1.0)
     shape = base | {"shape": "even_power", "exponent": 2.0, "scale": 2.0, "low": -1.0, "high": 1.0, "memory_scale": 2.0}
@@ -209,11 +214,11 @@ def test_gates():
 
 @pytest.mark.parametrize(("other", "full", "half"), [("motor_speed", 40.0, -20.0), ("disc_temperature", 220.0, 120.0)])
 def test_a_second_signal_multiplies_by_its_size(other, full, half):
-    """Whichever way it points, a temperature from 20 degC on, and no more beyond where it was found."""
+    """Whichever way it points, a temperature from 20 degC on, and a quarter more beyond where it was found."""
     base = {"name": "term:x", "port": "torque", "signal": "brake_torque", "shape": "odd_power", "coefficient": 0.5}
     term = Term(**base, low=0.0, high=1.0, other=other, other_high=full)
     sizes = np.array([half, full, 1.5 * full, term.other_from, np.nan])
-    np.testing.assert_allclose(over(term, np.ones(5), **{other: sizes}), [0.25, 0.5, 0.5, 0.0, 0.0])
+    np.testing.assert_allclose(over(term, np.ones(5), **{other: sizes}), [0.25, 0.5, 0.625, 0.0, 0.0])
     # What follows slowly follows the product: after the brake is hot it needs no heat to go on.
     slow = Term(
         **base | {"shape": "even_power"}, memory="response", memory_scale=2.0, low=0.0, high=1.0, other=other, other_high=full
@@ -224,13 +229,21 @@ def test_a_second_signal_multiplies_by_its_size(other, full, half):
     assert found[0] == 0.5 and found[999] == pytest.approx(0.5 * (1.0 - lag(500 * DT)), rel=1e-6)
 
 
+def test_beyond_its_range_a_term_is_no_more_than_its_port_may_bear():
+    term = Term(name="term:x", port="stiffness", signal="brake_torque", shape="odd_power", coefficient=-0.8, low=0.0, high=1.0)
+    np.testing.assert_allclose(over(term, np.array([1.0, 1.1, 1.25, 9.0])), [-0.8, -0.88, -0.9, -0.9])
+    other = {"other": "disc_speed", "other_high": 10.0, "port": "gear_gain", "coefficient": 0.1}
+    found = over(msgspec.structs.replace(term, **other), np.full(3, 0.5), disc_speed=np.array([5.0, 11.0, 99.0]))
+    np.testing.assert_allclose(found, 0.05 * np.array([0.5, 1.1, 1.25]))
+
+
 def test_a_signal_that_is_not_known_adds_nothing():
     term = Term(name="term:x", port="force", signal="pad_temperature", shape="constant", coefficient=7.0, low=0.0, high=1.0)
     assert over(term, np.array([np.nan])) == 0.0
 
 
 def test_sigma_grows_outside_of_the_range(calibration):
-    """What nobody has measured is held at the edge, and doubted by its size for each width of the range beyond."""
+    """What nobody has measured is doubted by its size for each width of the range beyond."""
     term = Term(
         name="term:x",
         port="stiffness",
@@ -383,7 +396,7 @@ def test_a_product_is_held_at_what_its_port_may_bear(port, least, most):
     scale=st.floats(0.1, 10.0),
     exponent=st.floats(0.1, 4.0),
 )
-def test_a_term_adds_nothing_beyond_its_reach(shape, coefficient, centre, scale, exponent):
+def test_a_term_adds_no_more_than_its_reach_within_its_range(shape, coefficient, centre, scale, exponent):
     """What is held against the limits of its port is what the kernel does, at most, and reached for a power."""
     sine = 0.5 * coefficient if shape == "harmonic" else 0.0
     term = Term(
@@ -393,7 +406,7 @@ def test_a_term_adds_nothing_beyond_its_reach(shape, coefficient, centre, scale,
     record = np.zeros(1, terms.PARAMETERS)[0]
     fill_terms(record, (term,))
     signals = np.zeros((101, len(terms.SIGNALS)))
-    signals[:, list(terms.SIGNALS).index("motor_speed")] = np.linspace(-4.0, 7.0, 101)
+    signals[:, list(terms.SIGNALS).index("motor_speed")] = np.linspace(-2.0, 5.0, 101)
     added = terms.evaluate(record["term"][0], signals, np.full(101, DT), 3e4)
     least, most = term.reach
     slack = 1e-9 * abs(coefficient)
@@ -438,6 +451,8 @@ _EXPORTED = (
     Term(name="term:x4", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
          coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0,
          other="clamp_force", other_high=8e3),
+    Term(name="term:x6", port="stiffness", signal="clamp_force", memory="peak", shape="odd_power", coefficient=0.05,
+         scale=2e4, exponent=1.5, memory_scale=0.4, low=0.0, high=2e4),
     Term(name="term:x5", port="gear_friction", signal="clamp_force", shape="odd_power", coefficient=0.1, scale=2e4, low=0.0,
          high=2e4, other="motor_speed", other_high=5.0),
 )  # fmt: skip

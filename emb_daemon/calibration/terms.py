@@ -57,7 +57,8 @@ class Term(Struct, kw_only=True):
     #: none: z is the signal; lag: z is the signal through a first-order lag of time constant memory_scale, s; deficit: z is
     #: that lag's output minus the signal; slip: z is the state, -1 to 1, of a Maxwell slip element of stretch memory_scale, in
     #: the signal's unit; response: z is the signal, and the lag acts on the output of the shape, as heat follows the power
-    #: that makes it.
+    #: that makes it; peak: z is the lag's output, but follows a rise at once, as what a material remembers of its largest
+    #: strain.
     memory: _Memory = "none"
     #: constant: 1; odd_power: sign(u)|u|^exponent; even_power: |u|^exponent; saturation: u/(1 + |u|); decay: exp(−|u|); onset:
     #: max(u, 0); harmonic: coefficient cos u + sine sin u; bump: exp(−u²).
@@ -79,16 +80,16 @@ class Term(Struct, kw_only=True):
     exponent: Annotated[float, Meta(gt=0.0, le=4.0)] = 1.0
     #: Time constant, s; of a slip element its stretch, in the signal's unit.
     memory_scale: Positive = 1.0
-    #: Low end of the range of the signal in which the term was found. Outside the range the term keeps its value at the edge,
-    #: and the force's standard deviation grows.
+    #: Low end of the range of the signal in which the term was found. Outside the range the term goes on as it is shaped for a
+    #: quarter of the range's width and is held from there on, and the force's standard deviation grows.
     low: float
     #: High end of that range.
     high: float
     #: A second signal, to which the term is proportional: to its size, for a temperature to the distance above 20 °C. The
     #: hidden state of a response follows the product.
     other: _Signal | None = None
-    #: The largest value of that signal at which the term was found, in its unit: there the term acts in full. Beyond it the
-    #: term stays the same, and sigma grows.
+    #: The largest value of that signal at which the term was found, in its unit: there the term acts in full. It goes on to
+    #: rise for another quarter, and sigma grows.
     other_high: float = 0.0
     #: Date and logs from which the term was found.
     provenance: str = ""
@@ -127,7 +128,7 @@ class Term(Struct, kw_only=True):
 
     @property
     def is_held(self) -> bool:
-        """Whether the kernel limits it at run time: what a response reaches depends on how long its signal lasts, and two
+        """Whether the kernel limits it within its range: what a response reaches depends on how long its signal lasts, and two
         signals are hardly at their largest at once, so that `reach` would be too wide a bound."""
         return self.memory == "response" or self.other is not None
 
@@ -170,8 +171,10 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["other_from"], row["other_high"] = term.other_from, term.other_high
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
-        row["limit"], row["growth"] = (term.limit, term.growth) if term.is_held else (np.inf, np.inf)
         least, most = term.reach
+        # Within its range it is what it is, as long as a fit asks whether its port may bear that; beyond, no more than that.
+        inside = (0.0, 0.0) if term.is_held else (-least, most)
+        row["limit"], row["growth"] = max(term.limit, inside[0]), max(term.growth, inside[1])
         row["most"] = max(min(-least, row["limit"]), min(most, row["growth"]))
 
 

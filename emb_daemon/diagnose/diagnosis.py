@@ -443,13 +443,15 @@ def _left(
             found = dependences(channel, gains, model.counted(channel), least)
         means = None if model.bench.own_data else judging.means(channel, samples)
         first, last = (rms_known(residual[channel], means) for residual in (before, after))
-        known, log = screening.achieved(model, channel, force, rise, samples), ""
+        known, log, time_s = screening.achieved(model, channel, force, rise, samples), "", None
         if channel in FORCE_CHANNELS and not is_beyond(last, known):
             each = _by_log(selection, channel, judging, before[channel], after[channel])
             if channel in selection.refused and channel not in selection.touched:
                 each += _by_log(selection, channel, model.bench, *2 * [screening.initial[channel]])
             if beyond := [one for one in each if is_beyond(*one[1:3])]:
                 first, last, known, log = max(beyond, key=lambda one: one[1] / one[2])
+            elif channel == "stiffness" and (alone := _in_one_episode(selection, judging, before[channel], after[channel])):
+                first, last, known, log, time_s = alone
         if channel == CHANNEL_OF_HEAT and (heat := heat_bench((t.log for t in judging.trials), judging.calibration)):
             # Where the brake torque is measured the pads' friction has no share in it.
             first, last = (rms_known(heat.residual_of(to_parameters(c))) for c in (judging.calibration, augmented))
@@ -459,8 +461,25 @@ def _left(
         found = [*withdrawn, *(d for d in found if d.signal not in {w.signal for w in withdrawn})]
         found.sort(key=lambda dependence: -dependence.share)
         share = (last / first) ** 2 if first > 0.0 else 0.0
-        result[channel] = Left(channel, last, known, share, tuple(found), log)
+        fitted = float("nan") if log or judging is model.bench else _left_of_fitted(selection, channel, last, known)
+        result[channel] = Left(channel, last, known, share, tuple(found), log, time_s, fitted)
     return result
+
+
+def _left_of_fitted(selection: Selection, channel: str, rms: float, known: float) -> float:
+    """What lasts of a channel on the fitted logs (RMS) by the forces of the judging ones, of which the calibration achieves
+    ``known``, where ``rms`` is left of these; NaN where no term was made, or the difference does not matter.
+
+    A term's shape is a guess beyond what was fitted. What no term was made for differs from log to log as the calibration's
+    own figures do, and is held against these alone."""
+    model, screening = selection.model, selection.screening
+    made = [name for name in selection.accepted if selection.candidates[name].made and selection.channel_of(name) == channel]
+    if not made or channel not in FORCE_CHANNELS or not model.bench.has_reference:
+        return float("nan")
+    samples = LASTING[channel]
+    own = screening.achieved(model, channel, _force_of(model.bench), np.zeros(0), samples)
+    left = rms_known(model.residual[channel], model.bench.means(channel, samples)) * known / own
+    return left if rms**2 - left**2 >= screening.floor(model, channel) ** 2 else float("nan")
 
 
 def _by_log(
@@ -471,7 +490,7 @@ def _by_log(
     if not bench.has_reference or bench.own_data:
         return []
     samples, force, result = LASTING[channel], _force_of(bench), []
-    means, index = bench.means(channel, samples), np.repeat(range(len(bench.trials)), [len(t.episode) for t in bench.trials])
+    means, index = bench.means(channel, samples), _index_of_log(bench)
     for number, trial in enumerate(bench.trials):
         if trial.episode[-1] + 1 >= EPISODES:
             own = index == number
@@ -479,6 +498,37 @@ def _by_log(
             pair = (rms_known(np.where(own, residual, 0.0), means) for residual in (before, after))
             result.append((*pair, known, bench.sources[number]))
     return result
+
+
+def _in_one_episode(
+    selection: Selection, bench: Bench, before: np.ndarray, after: np.ndarray
+) -> tuple[float, float, float, str, float] | None:
+    """The same of the stiffness path in the worst of the episodes, with the time (s) of its middle; None where that is no more
+    than chance, or does not matter in all logs.
+
+    What holds on the fitted logs may not hold on a stop that is hotter or harder than those, and hundreds of newtons in one
+    are little in the mean of many. Not of the torque path: friction is not the same in all stops, which is stated
+    (`_with_lasting`)."""
+    channel, samples = "stiffness", LASTING["stiffness"]
+    if not bench.has_reference or bench.own_data:
+        return None
+    means, episode = bench.means(channel, samples), bench.episode[channel]
+    squared = np.bincount(means.episode, means.of(after[:, None])[:, 0] ** 2, bench.episodes)
+    least = selection.screening.floor(selection.model, channel) ** 2 * np.count_nonzero(after * means.told)
+    force, index, result = _force_of(bench), _index_of_log(bench), []
+    time_s = np.concatenate([trial.log.time_s for trial in bench.trials])
+    for number in np.flatnonzero(squared > least).tolist():
+        own = episode == number
+        known = selection.screening.achieved(selection.model, channel, force[own], np.zeros(0), samples)
+        first, last = (rms_known(np.where(own, residual, 0.0), means) for residual in (before, after))
+        if is_beyond(last, known, alone=True):
+            result.append((first, last, known, bench.sources[index[own][0]], float(time_s[own].mean())))
+    return max(result, key=lambda one: one[1] / one[2], default=None)
+
+
+def _index_of_log(bench: Bench) -> np.ndarray:
+    """Number of the log that each sample is of, shape (N,)."""
+    return np.repeat(range(len(bench.trials)), [len(trial.episode) for trial in bench.trials])
 
 
 def _force_of(bench: Bench) -> np.ndarray:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from emb_daemon.calibration.terms import Term
-from emb_daemon.effects.terms import SIGNALS
+from emb_daemon.effects.terms import BEYOND, SIGNALS
 
 #: Expressions of the shapes over u, by name.
 _SHAPED = {
@@ -42,6 +42,7 @@ _MEMORIES = {
 """,
 }
 _MEMORIES["deficit"] = _MEMORIES["lag"]
+_MEMORIES["peak"] = f"{_MEMORIES['lag']}    s.memory = max(s.memory, x)\n"
 #: Memory that acts after the shape instead of before it.
 _RESPONSE = """    y = {shaped}
     if not s.begun:
@@ -52,7 +53,7 @@ _RESPONSE = """    y = {shaped}
 _OTHER = """    y = signals[_OTHER]
     if not np.isfinite(y):
         return 0.0
-    share = min(max(({size}) / (_FULL - _NONE), 0.0), 1.0)
+    share = min(max(({size}) / (_FULL - _NONE), 0.0), {most!r})
 """
 #: With which the file is a command as well.
 _MAIN = """\
@@ -90,7 +91,7 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
         equation: the term as an engineer writes it.
     """
     gate, kernel, words = _GATES[term.gate], _kernel(term), term.signal.replace("_", " ").capitalize()
-    used = "\n".join(kernel)
+    used, further = "\n".join(kernel), BEYOND * (term.high - term.low)
     functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in used]
     looked_at = {"_SIGNAL": term.signal} | {key: name for key, name in _LOOKED_AT.items() if key in gate}
     looked_at |= {"_OTHER": term.other} if term.other else {}
@@ -108,8 +109,8 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
         *(["from emb_daemon.models.wheel import TURNING_RAD_PER_S"] if "TURNING" in gate else []),
         "",
         *(f'{key} = list(SIGNALS).index("{name}")' for key, name in looked_at.items()),
-        f"#: {words} ({SIGNALS[term.signal]}) between which it was found; outside it stays what it is at the edge.",
-        f"_LOW, _HIGH = {term.low!r}, {term.high!r}",
+        f"#: {words} ({SIGNALS[term.signal]}) between which it is shaped: where it was found, and some way on.",
+        f"_LOW, _HIGH = {term.low - further!r}, {term.high + further!r}",
     ]
     if term.other:
         own = f"{term.other.replace('_', ' ').capitalize()} ({SIGNALS[term.other]})"
@@ -133,7 +134,7 @@ def _kernel(term: Term) -> list[str]:
     body = ("s.memory" if response else f"({shaped})") + (f" * {_GATES[term.gate]}" if _GATES[term.gate] else "")
     if not harmonic:
         body = f"p.coefficient * {body}"
-    if term.is_held and np.isfinite(term.limit):
+    if np.isfinite(term.limit):
         body = f"min(max({body}, -{term.limit!r}), {term.growth!r})"
     z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
     arguments = {"none": "p, signals", "slip": "p, s, signals"}.get(term.memory, "p, s, signals, dt")
@@ -144,7 +145,11 @@ def _kernel(term: Term) -> list[str]:
         "    x = signals[_SIGNAL]",
         f"    if p.coefficient == 0.0{' and p.sine == 0.0' if harmonic else ''} or not np.isfinite(x):",
         "        return 0.0",
-        *(_OTHER.format(size="y - _NONE" if term.other_from else "abs(y)").splitlines() if term.other else []),
+        *(
+            _OTHER.format(size="y - _NONE" if term.other_from else "abs(y)", most=1.0 + BEYOND).splitlines()
+            if term.other
+            else []
+        ),
         *_MEMORIES.get(term.memory, "").splitlines(),
         *([] if term.shape == "constant" else [f"    u = ({z} - p.centre) / p.scale"]),
         *response.splitlines(),

@@ -52,6 +52,9 @@ _TYPED: dict[str, tuple[str, ...]] = {
     "pad_heat": ("disc_speed", "time_since_last_clamp"),
     "disc_heat": ("disc_speed", "time_since_last_clamp"),
 }
+#: Signals of which a port follows the largest of late and nothing else: pads remember how fast they were pressed, but a motion
+#: by itself is no elastic state.
+_REMEMBERED: dict[str, tuple[str, ...]] = {"thickness": ("motor_speed",), "stiffness": ("motor_speed",)}
 #: Ports at which there are forms.
 FORMED = tuple(_TYPED)
 _GATES: dict[str, tuple[str, ...]] = {
@@ -69,6 +72,8 @@ _MULTIPLIED = (
 _ALONE = ("motor_angle", "travel", "energy", "time_clamped", "time_since_last_clamp")
 #: Exponents of powers; scales of what saturates or decays, as shares of a signal's range; places along it; s.
 _EXPONENTS, _SCALES, _PLACES, _TIMES_S = (0.5, 1.0, 2.0), (0.03, 0.1, 0.3), (0.25, 0.5), (2.0, 10.0, 50.0)
+#: Times (s) in which the largest value of a signal is forgotten: within a drive, and hardly.
+_FORGOTTEN_S = (10.0, 1000.0)
 _CREEP_S, _SLIPS, _BUMPS = (0.5, 3.0, 15.0, 60.0), (0.03, 0.1, 0.3), 16
 #: Bounds of a fitted size over the one that was tried, and its standard deviation over it.
 _WIDER, _SHAPE = 8.0, 0.5
@@ -117,7 +122,7 @@ class Form:
         own = () if self.straight else own
         if self.memory == "none":
             return own
-        if self.memory == "lag" and self.signal != "clamp_force":
+        if self.memory == "peak" or (self.memory == "lag" and self.signal != "clamp_force"):
             return (*own, "memory_scale")
         return ("memory_scale",) if self.shape == "odd_power" else (*own, "memory_scale")
 
@@ -176,7 +181,7 @@ def enumerate_forms(covered: Mapping[str, tuple[float, float]], ports: tuple[str
     """All terms at some ports but harmonics, whose orders are scanned. ``covered``: range of each signal that varies."""
     found = []
     for port in ports:
-        for signal in _TYPED.get(port, ()):
+        for signal in (*_TYPED.get(port, ()), *_REMEMBERED.get(port, ())):
             if signal not in covered:
                 continue
             low, high = covered[signal]
@@ -215,7 +220,7 @@ def enumerate_products(covered: Mapping[str, tuple[float, float]], ports: tuple[
 def places(ports: Iterable[str]) -> int:
     """How many pairs of port and signal there are at some ports: what says where a term acts and what it follows is one of
     these."""
-    return sum(len(_TYPED.get(port, ())) for port in ports)
+    return sum(len(_TYPED.get(port, ())) + len(_REMEMBERED.get(port, ())) for port in ports)
 
 
 def harmonic(port: str, order: float, centre: float, covered: Mapping[str, tuple[float, float]]) -> Form:
@@ -252,6 +257,9 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
         return
     centre = _COLD_C if signal in TEMPERATURES else 0.0
     farthest = max(abs(low - centre), abs(high - centre))
+    if signal in _REMEMBERED.get(port, ()):
+        yield from _peaks(high, centre)
+        return
     if HOOKS[port].channel == "temperature":
         # Temperatures are lagged already: no further memory.
         yield from (("none", "odd_power", farthest, centre, exponent, 1.0) for exponent in _EXPONENTS)
@@ -268,6 +276,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
             yield "slip", "odd_power", 1.0, 0.0, 1.0, share * width
         for time in _CREEP_S:
             yield "lag", "odd_power", reach, 0.0, 1.0, time
+        yield from _peaks(reach, centre)
         return
     signed = low < 0.0 and signal not in TEMPERATURES
     even = port in ("torque_constant", "gear_friction", "gear_gain") and signed
@@ -284,6 +293,7 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
     if signal in (*TEMPERATURES, "disc_speed", "brake_torque", "friction_power", "clamp_force"):
         for time in _TIMES_S:
             yield "lag", "odd_power", farthest, centre, 1.0, time
+        yield from _peaks(farthest, centre)
     if signal in ("disc_speed", "brake_torque", "friction_power", "clamp_force"):
         # A response to the first power of a signal is the lag above.
         yield from _responses(reach, (2.0,))
@@ -291,6 +301,12 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
             for place in _PLACES:
                 yield "response", "onset", width, low + place * width, 1.0, time
             yield "response", "decay", _SCALES[-1] * reach, 0.0, 1.0, time
+
+
+def _peaks(reach: float, centre: float) -> Iterator[_Shape]:
+    """What follows the largest value of late."""
+    for time in _FORGOTTEN_S:
+        yield "peak", "odd_power", reach, centre, 1.0, time
 
 
 def _responses(reach: float, exponents: tuple[float, ...] = _EXPONENTS) -> Iterator[_Shape]:
@@ -338,6 +354,7 @@ def equation(term: Term) -> str:
         "response": x,
         "lag": f"[{x} through a lag of {term.memory_scale:.3g} s]",
         "deficit": f"[what of {x} is still to come with {term.memory_scale:.3g} s, negative]",
+        "peak": f"[largest {x}, forgotten in {term.memory_scale:.3g} s]",
         "slip": f"[slip of {x}, ±1 within {term.memory_scale:.3g} {own}]",
     }[term.memory]
     times = ""

@@ -180,7 +180,7 @@ def _axis(signal: str) -> str:
 
 
 def _where(left: Left) -> str:
-    return f"not explained on {left.log}" if left.log else "not explained" if left.present else ""
+    return f"not explained on {left.place}" if left.log else "not explained" if left.present else ""
 
 
 def _candidates(report: Page, diagnosis: Diagnosis) -> None:

@@ -76,6 +76,8 @@ def _left(left: Left) -> dict:
         "unit": UNITS[left.channel],
         "rms": left.rms,
         "log": left.log or None,
+        "time_s": left.time_s,
+        "left_of_fitted_logs": left.fitted if np.isfinite(left.fitted) else None,
         "achieved_by_calibration": left.achieved if np.isfinite(left.achieved) else None,
         "share": left.share,
         "dependences": [

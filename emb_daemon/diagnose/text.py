@@ -8,6 +8,7 @@ from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.signals import MANOEUVRES
+from emb_daemon.diagnose.unexplained import is_beyond
 from emb_daemon.effects.terms import SIGNALS
 
 #: Where a term acts, for people.
@@ -164,7 +165,7 @@ def _outside(diagnosis: Diagnosis) -> list[str]:
         told.append(
             f"In {100.0 * share:.0f} % of the validation logs' samples {in_words(signal)} is outside the range in which "
             f"{name} was found (there {reached[0]:.3g} to {reached[1]:.3g} {unit}, the range {least}{high:.3g} {unit}): "
-            "the term keeps the value of its edge."
+            "there the term is a guess."
         )
     return told
 
@@ -234,12 +235,18 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
     left = diagnosis.unexplained
     if left is None:
         return []
-    unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.log}" if left.log else ""
+    unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.place}" if left.log else ""
     if left.beyond:
         size = f"{left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}"
-        text = f"Not explained by any known effect: {size}, where {left.achieved:.3g} {unit} are {least_left(diagnosis)}"
+        known = f"{left.achieved:.3g} {unit} are {least_left(diagnosis)}"
+        if not is_beyond(left.rms, left.achieved):
+            known = f"{left.fitted:.3g} {unit} are left of the logs in which a term was made for it"
+        text = f"Not explained by any known effect: {size}, where {known}"
     else:
         text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
+    if strongest is None and left.elsewhere:
+        told = f"{text}. What would tell: more such manoeuvres in the logs that are fitted."
+        return [told, *_withdrawn(diagnosis, left.channel)]
     if strongest is None:
         return [f"{text}, which depend on no signal that was recorded.", *_withdrawn(diagnosis, left.channel)]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"

@@ -16,6 +16,9 @@ _LEAST_SHARE = 0.05
 #: from log to log and pad to pad, units by less. A dependence that adds less to what noise leaves of the means it is seen in
 #: is within that scatter.
 CLEARLY, _SCATTER = 1.5, 1.25
+#: The same of one episode: the largest of forty that scatter by a quarter is 1.6 times their mean, and 2.2 times once in a
+#: hundred logs.
+_ALONE = 2.25
 #: Part of a mean's time after which noise has forgotten itself: current sensors average over some milliseconds, torque is held
 #: against terms as means over an eighth of a second.
 _FORGOTTEN = 4
@@ -74,6 +77,9 @@ class Left:
         share: of the mean square there was before, that is left.
         dependences: on signals, strongest first.
         log: the only one on which so much is left, if it is not all.
+        fitted: where a term was made that does not carry over whole, what it leaves of the fitted logs, by the forces of
+            these; else NaN.
+        time_s: on that log, at the middle of the only episode in which so much is left, if it is not all of the log.
     """
 
     channel: str
@@ -82,11 +88,13 @@ class Left:
     share: float
     dependences: tuple[Dependence, ...]
     log: str = ""
+    time_s: float | None = None
+    fitted: float = float("nan")
 
     @property
     def beyond(self) -> bool:
-        """Whether the residual is clearly above what the calibration achieved."""
-        return is_beyond(self.rms, self.achieved)
+        """Whether the residual is clearly above what the calibration achieved, or what a term leaves of the fitted logs."""
+        return is_beyond(self.rms, self.achieved) or is_beyond(self.rms, self.fitted)
 
     @property
     def present(self) -> bool:
@@ -94,14 +102,26 @@ class Left:
 
     @property
     def strongest(self) -> Dependence | None:
-        """What the residual depends on most: surely, or else by a share that is worth a word; none where no signal tells."""
-        worth = (d for d in self.dependences if d.share >= _LEAST_SHARE)
+        """What the residual depends on most: surely, or else by a share that is worth a word; none where no signal tells, or
+        where it is left `elsewhere`."""
+        worth = (d for d in self.dependences if d.share >= _LEAST_SHARE and not self.elsewhere)
         return next(iter([*(d for d in self.dependences if d.matters), *worth]), None)
 
+    @property
+    def elsewhere(self) -> bool:
+        """Whether it is left where the fitted logs, of which the dependences are, do not tell."""
+        return self.time_s is not None or (not is_beyond(self.rms, self.achieved) and is_beyond(self.rms, self.fitted))
 
-def is_beyond(rms: float, known: float) -> bool:
-    """Whether a residual is clearly above what the calibration achieved; not where it does not say."""
-    return rms > CLEARLY * known
+    @property
+    def place(self) -> str:
+        """Where so much is left, in words, if it is not everywhere."""
+        return self.log if self.time_s is None else f"{self.log} at {self.time_s:.0f} s"
+
+
+def is_beyond(rms: float, known: float, alone: bool = False) -> bool:
+    """Whether a residual is clearly above what the calibration achieved, or that of an episode ``alone``; not where it does
+    not say."""
+    return rms > (_ALONE if alone else CLEARLY) * known
 
 
 def least_dependence(residual: np.ndarray, samples: int) -> float:

@@ -44,8 +44,8 @@ SIGNALS = {
     "friction_power": "W",
 }
 #: Memory of a term's signal x: none; lag: z of τ dz/dt + z = x; deficit: z − x; slip: a Maxwell slip element of stretch
-#: ``memory_scale``, z in [-1, 1]; response: the same lag, of the output of the shape.
-MEMORIES = ("none", "lag", "deficit", "slip", "response")
+#: ``memory_scale``, z in [-1, 1]; response: the same lag, of the output of the shape; peak: the lag, but a rise at once.
+MEMORIES = ("none", "lag", "deficit", "slip", "response", "peak")
 #: Functions of u = (z − centre)/scale: 1; sign(u)|u|^n; |u|^n; u/(1 + |u|); exp(−|u|); max(u, 0); c cos u + d sin u; exp(−u²).
 SHAPES = ("constant", "odd_power", "even_power", "saturation", "decay", "onset", "harmonic", "bump")
 #: When a term acts; ``load`` multiplies it by the clamp force over the largest.
@@ -53,11 +53,15 @@ GATES = ("always", "load", "closing", "opening", "turning", "standing")
 
 (_ANGLE, _TRAVEL, _SPEED, _FORCE, _RATE, _CURRENT, _PADS, _DISC, _CALIPER, _WHEEL, _BRAKE, _ENERGY, _CLAMPED, _RELEASED,
  _WINDING, _HOUSING, _SURFACE, _POWER) = range(len(SIGNALS))  # fmt: skip
-_NONE, _LAG, _DEFICIT, _SLIP, _RESPONSE = range(len(MEMORIES))
+_NONE, _LAG, _DEFICIT, _SLIP, _RESPONSE, _PEAK = range(len(MEMORIES))
 _CONSTANT, _ODD, _EVEN, _SATURATION, _DECAY, _ONSET, _HARMONIC, _BUMP = range(len(SHAPES))
 _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
 (_THICKNESS, _MOTOR_ANGLE, _STIFFNESS, _STATIC_FORCE, _TORQUE_CONSTANT, _TORQUE, _GEAR_GAIN, _GEAR_FRICTION, _PAD_FRICTION,
  _AMPERE, _RELAXATION, _SHARE, _CONTACT, _GAP, _THROUGH, _COOLING, _PAD_HEAT, _DISC_HEAT) = range(len(PORTS))  # fmt: skip
+
+#: Widths of its range by which a term goes on beyond it as it is shaped, before it is held: of terms of drawn brakes whose
+#: second drive was hotter or harder, a constant left two to four times as much as was left within the range.
+BEYOND = 0.25
 
 #: Clamp force from which the brake counts as clamped, N.
 CLAMPED_N = 150.0
@@ -124,7 +128,9 @@ def _remember(q, t, k, x, dt):
     if t.begun[k] == 0:
         t.begun[k] = 1
         t.memory[k], t.before[k] = (0.0 if q.memory == _SLIP else x), x
-    if q.memory == _SLIP:
+    if q.memory == _PEAK and x > t.memory[k]:
+        t.memory[k] = x
+    elif q.memory == _SLIP:
         t.memory[k] = min(max(t.memory[k] + (x - t.before[k]) / q.memory_scale, -1.0), 1.0)
     else:
         t.memory[k] += (1.0 - exp(-dt / q.memory_scale)) * (x - t.memory[k])
@@ -178,14 +184,16 @@ def _of_other(q, signal):
 
 @njit
 def _value(q, t, k, dt, maximum_force):
-    """Amount that term ``k`` adds at its port, in the port's unit; outside its range the amount at the edge."""
+    """Amount that term ``k`` adds at its port, in the port's unit; outside its range as shaped for `BEYOND` of its width, then
+    held, and never beyond its limits."""
     x, share = t.signal[q.signal], 1.0
     if q.other >= 0:
         share = _of_other(q, t.signal)
     if not (np.isfinite(x) and np.isfinite(share)):
         return 0.0
-    share = min(max(share, 0.0), 1.0)
-    x = min(max(x, q.low), q.high)
+    share = min(max(share, 0.0), 1.0 + BEYOND)
+    further = BEYOND * (q.high - q.low)
+    x = min(max(x, q.low - further), q.high + further)
     if q.memory == _RESPONSE:
         shaped = _remember(q, t, k, share * _shape(q, x), dt)
     else:

@@ -248,6 +248,9 @@ def clamp(p: Record, s: Record) -> None:
     s.past_contact = x
     drive = s.stiffness_factor * s.static_force * (1.0 + hysteresis.share * s.slip + further.share * s.further_slip)
     coupled = e.brake_torque_coupling.per_Nm * s.brake_torque
+    if e.fastest_closing.share != 0.0:
+        s.fastest = max(s.fastest * (1.0 - SUBSTEP_S / e.fastest_closing.recovery_s), s.speed)
+        coupled += e.fastest_closing.share * (s.fastest / _SPEED_RAD_PER_S) ** e.fastest_closing.exponent
     drive *= 1.0 + coupled + drawn_amount(e.drawn_stiffness, s, s.drawn.stiffness, SUBSTEP_S)
     excitation = drive
     if e.second_relaxation.share != 0.0:

@@ -34,6 +34,8 @@ DRAWN = (
 #:     brake_torque_coupling  relative gain of clamp force with brake torque, 1/(N m)
 #:     caliper_softening      relative loss of stiffness as the caliper warms over 22 degC, 1/K
 #:     spindle_lead_error     travel error, um, over the spindle's turn, whose order is periods per motor turn
+#:     fastest_closing        relative gain of stiffness with the fastest closing of late, per (100 rad/s)^exponent; it is
+#:                            forgotten with a time constant
 #:     cold_grease            relative rise of gear friction as the caliper cools below 22 degC, 1/K, and viscous friction at
 #:                            12 degC, N m s/rad, which doubles every further 10 K down
 #:     current_delay          s by which the mean of the measured current ends early, up to 12 ms
@@ -47,6 +49,7 @@ EFFECTS: dict[str, tuple[str, ...]] = {
     "brake_torque_coupling": ("per_Nm",),
     "caliper_softening": ("per_K",),
     "spindle_lead_error": ("amplitude_um", "order_per_turn", "phase_rad"),
+    "fastest_closing": ("share", "exponent", "recovery_s"),
     "cold_grease": ("per_K", "viscous_Nms_per_rad"),
     "current_delay": ("delay_s",),
     **dict.fromkeys((f"drawn_{place}" for place in DRAWN), ("size", "signal", "shape", "exponent", "other", "lag_s")),
@@ -131,7 +134,7 @@ PLANT_STATE = np.dtype(
     [
         *fields("f8", "angle speed current friction"),
         # Clamp: backlash output, travel past contact, slip elements, drives of the relaxations and their states.
-        *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower creep motor_heat"),
+        *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower creep motor_heat fastest"),
         # Amounts that drawn effects with a lag add.
         ("drawn", [(place, fields("f8", "amount")) for place in DRAWN]),
         *fields("f8", "excitation force force_rate static_force stiffness_factor"),
