@@ -312,14 +312,14 @@ def test_a_brake_that_is_held_as_known_stays_so(p):
 
 
 def test_a_curve_that_may_be_off_by_all_of_the_force_leaves_it_to_the_torque(p):
-    """A slow stroke of a brake whose force is twice what its curve says: from a standard deviation of the whole force on the
-    torque path alone is believed, and nothing is learned of motor and friction."""
+    """A slow stroke of a brake whose force is twice what its curve says: from a standard deviation of 1.41 times the force
+    on the torque path alone is believed, and nothing is learned of motor and friction."""
     stroke = np.concatenate([np.zeros(250), brake.clamp(p, 12.0, 5.0), brake.clamp(p, 12.0, 5.0)[::-1]])
     rows, force = brake.samples(p, stroke)
     moving = (force > 1000.0) & (np.abs(rows["speed"]) > 1.0)
     p["curve"] *= 0.5
     shares, errors = [], []
-    for relative in (0.9, 1.0):
+    for relative in (1.4, 1.42):
         p["stiffness_relative_sigma"] = relative
         estimates = estimate(rows, p)
         shares.append(np.mean(estimates["source"][moving] == TORQUE_ONLY))

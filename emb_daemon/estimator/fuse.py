@@ -122,9 +122,10 @@ _TOLD_CYCLES = 2.0
 #: Time for which an unexplained error of the torque is constant, s: until temperature and force of the brake are others, which
 #: takes some stops.
 _LASTS_S = 10.0
-#: Share of the force, as standard deviation of the stiffness path, from which it tells none: from nothing to twice as much is
-#: then within it. So large an error lasts, and what motor and friction would learn beside it is wrong.
-_TELLS_NOTHING = 1.0
+#: Share of the force, as standard deviation of the stiffness path, from which it tells none. A curve that is not measured up
+#: to the largest force is given one of all of it at most (`identify`); as much again are errors that logs have shown. Errors
+#: of that size last, and what motor and friction would learn beside them is wrong.
+_TELLS_NOTHING = sqrt(2.0)
 #: Way of a whole stroke, over which counts are lost in the same direction, as time at the motor's maximum speed, s.
 _STROKE_S = 0.25
 #: Share of the clearance by which pads are certainly apart: the motor must have gone back so far before a jump is proven, and
@@ -495,7 +496,7 @@ def take_sides(
     facts = _facts_of_torque(s, p)
     # A latched brake needs no current: the torque alone then says that nothing is known.
     latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
-    if (s.unknown or s.contact.lost or not _tells(p)) and c.verdict == AGREE and swings == 0:
+    if (s.unknown or not _tells(p)) and c.verdict == AGREE and swings == 0:
         # What force belongs to the angle is unknown, but friction follows its motion.
         force, sigma = _torque_beside_motion(s, p, m, friction_variance)
     if s.unknown:
