@@ -17,7 +17,6 @@ from emb_daemon.identify import validation
 from emb_daemon.identify.example import FILES
 from emb_daemon.identify.steps import attribution, noise, stiffness
 from emb_daemon.logs.write import write_frames
-from emb_daemon.offline import estimate
 from emb_daemon.plant import scenarios as sc
 from emb_daemon.plant.derive import plant_from_calibration
 from studies.drives import rig_stop
@@ -97,12 +96,13 @@ def test_angle_and_force_alone_give_the_curve(tmp_path, capsys):
     _judge(tmp_path, 400.0, first=100)
 
 
-def _overconfident(monkeypatch, share=0.1):
-    """Judge with that ``share`` of the sigma, as where something is hidden that noise levels do not hold."""
+def _overconfident(monkeypatch):
+    """Judge with a tenth of the sigma, as where something is hidden that noise levels do not hold."""
+    honest = validation.estimate
 
     def overconfident(samples, parameters):
-        estimates = estimate(samples, parameters)
-        estimates["sigma"] *= share
+        estimates = honest(samples, parameters)
+        estimates["sigma"] *= 0.1
         return estimates
 
     monkeypatch.setattr(validation, "estimate", overconfident)
@@ -125,17 +125,9 @@ def test_sigma_covers_a_force_that_collapses_and_rises_again(tmp_path, capsys, m
         and found.noise.stiffness_N > 400.0
         and np.mean(np.abs(error) <= 2.0 * estimates["sigma"][1:]) > 0.9
     )
-    _overconfident(monkeypatch, 0.02)
+    _overconfident(monkeypatch)
     _identify(tmp_path, campaign)
     assert "curve.parquet, which was fitted: " in (told := capsys.readouterr().err) and "worse than it says" in told
-    assert load_calibration(tmp_path / "found.yaml").noise == found.noise, "no factor on the noise helps"
-    _overconfident(monkeypatch, 0.3)
-    _identify(tmp_path, campaign)
-    told, wider = capsys.readouterr().err, load_calibration(tmp_path / "found.yaml").noise
-    assert "worse than it says" not in told and "sigma is widened, by " in told
-    assert (
-        wider.stiffness_N > 1.2 * found.noise.stiffness_N and wider.stiffness_relative > 1.2 * found.noise.stiffness_relative
-    )
 
 
 def _dome(tmp_path, *names: str) -> None:

@@ -15,7 +15,7 @@ from emb_daemon.identify.campaign import Campaign
 from emb_daemon.identify.dynamics import DELAY, Pads
 from emb_daemon.identify.steps import Step, attribution, contact, held_out, noise, stiffness, thermal, thickness, torque
 from emb_daemon.identify.steps.held_out import Fold
-from emb_daemon.identify.validation import Validation, cover, validate, validate_fitted, validate_others, why_worse, widened
+from emb_daemon.identify.validation import Validation, validate, validate_fitted, validate_others, why_worse
 
 Progress = Callable[[float, str], None]
 #: Delay from which the reference force counts as late, s: half a cycle (twelve rigs whose instruments are in time show 0.4 ms
@@ -93,14 +93,8 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
         there, name = moved(found.without(fold), mine.values), f"random, {fold.pads.thickness_mm:g} mm"
         validations += [validate(name, "random", log, there) for log in fold.held_out]
     validations += validate_others(campaign, calibration, thick, motor)
-    judged = validations or validate_fitted(stiff.pads, calibration, thick)
-    factor, covered = cover(judged)
-    if factor > 1.0:
-        calibration, validations = widened(calibration, factor), covered if validations else []
-        for worse in why_worse(judged):
-            campaign.fault(f"{worse}: sigma is widened, by {factor:.2g} times the noise of both paths")
-    for fault in why_worse(covered):
-        campaign.fault(f"{fault}: the calibration is worse than it says")
+    for fault in why_worse(validations or validate_fitted(stiff.pads, calibration, thick)):
+        campaign.fault(fault)
     steps = (stiff, motor, heat, found)
     calibration = replace(calibration, provenance=provenance(campaign, steps, validations, heat))
     progress(1.0, "done")

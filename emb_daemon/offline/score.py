@@ -7,7 +7,7 @@ import numpy as np
 
 from emb_daemon.logs.columns import DEPTHS_MM, References, latest
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
-from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED, INVALID
+from emb_daemon.wire.contract import CONTACT_UNCERTAIN, FUSED
 
 #: Motor speed (rad/s) above which the brake clamps or releases; below, it holds.
 _MOVING = 5.0
@@ -93,9 +93,7 @@ def force_figures(samples: np.ndarray, estimates: np.ndarray, reference_N: np.nd
         result[path] = figures(error) | {
             "conditions": {name: figures(error[mask]) for name, mask in masks.items() if mask.any()}
         }
-    # A force that is said to be invalid claims nothing.
-    claimed = np.where(estimates["source"] == INVALID, np.nan, estimates["force"] - reference_N)
-    result["inside_two_sigma"] = share_inside(claimed, estimates["sigma"])
+    result["inside_two_sigma"] = share_inside(estimates["force"] - reference_N, estimates["sigma"])
     never = bool(np.all(estimates["reasons"] & CONTACT_UNCERTAIN))
     result["unknown_samples"] = len(estimates) if never else first
     return result
