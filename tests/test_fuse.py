@@ -17,7 +17,7 @@ from emb_daemon.models.plausibility import STIFFNESS_WRONG
 from emb_daemon.models.stiffness import characteristic_curve
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 from emb_daemon.offline import estimate
-from emb_daemon.wire.contract import CYCLE_S
+from emb_daemon.wire.contract import CYCLE_S, TORQUE_ONLY
 
 
 @pytest.fixture
@@ -309,3 +309,20 @@ def test_a_brake_that_is_held_as_known_stays_so(p):
     state = new_state()
     estimate(brake.samples(p, brake.clamp(p, 3.0, 0.05))[0], p, state)
     assert not np.diag(state["covariance"][0])[[*OF_THE_MODEL]].any()
+
+
+def test_a_curve_that_may_be_off_by_all_of_the_force_leaves_it_to_the_torque(p):
+    """A slow stroke of a brake whose force is twice what its curve says: from a standard deviation of 1.41 times the force
+    on the torque path alone is believed, and nothing is learned of motor and friction."""
+    stroke = np.concatenate([np.zeros(250), brake.clamp(p, 12.0, 5.0), brake.clamp(p, 12.0, 5.0)[::-1]])
+    rows, force = brake.samples(p, stroke)
+    moving = (force > 1000.0) & (np.abs(rows["speed"]) > 1.0)
+    p["curve"] *= 0.5
+    shares, errors = [], []
+    for relative in (1.4, 1.42):
+        p["stiffness_relative_sigma"] = relative
+        estimates = estimate(rows, p)
+        shares.append(np.mean(estimates["source"][moving] == TORQUE_ONLY))
+        errors.append([np.sqrt(np.mean((estimates[name] - force)[moving] ** 2)) for name in ("force", "stiffness_force")])
+    assert shares[0] < 0.9 and shares[1] == 1.0
+    assert errors[1][0] < 0.3 * errors[1][1]

@@ -14,6 +14,7 @@ from emb_daemon.models.plausibility import (
     beyond_friction,
     count_contradiction,
     due,
+    force_beside_friction,
     force_of_torque_alone,
     frozen,
     hold,
@@ -80,6 +81,20 @@ def test_force_of_torque_alone_settles_on_the_torque_with_friction_for_sigma():
     for _ in range(200):
         force, sigma = force_of_torque_alone(c, -0.4, True, _DT, 4e-5, 8e-6, 0.03, 0.0)
     assert force == 0.0 and sigma == pytest.approx(0.03 / 4e-5, rel=1e-3)
+
+
+def test_beside_a_motion_that_is_known_friction_is_taken_out_of_the_torque():
+    """0.4 N m at 4e-5 m/rad less 8e-6 m/rad and 0.03 N m of friction, each way; of a state that was forgotten as without."""
+    c = np.zeros(1, PLAUSIBILITY)[0]
+    alone = force_of_torque_alone(c, 0.4, True, _DT, 4e-5, 8e-6, 0.03, 0.0)
+    assert c["steady"] == 0.4, "the first torque counts in full"
+    for state, expected in ((1.0, 0.37 / 4.8e-5), (-1.0, 0.43 / 3.2e-5)):
+        force, sigma = force_beside_friction(c, state, 0.0, 4e-5, 8e-6, 0.03, 0.0)
+        assert force == pytest.approx(expected) and sigma < 1e-9
+        assert force_beside_friction(c, state, 1.0, 4e-5, 8e-6, 0.03, 0.0) == pytest.approx(alone)
+    half = force_beside_friction(c, 1.0, 0.5, 4e-5, 8e-6, 0.03, 1000.0)
+    assert half[0] == pytest.approx((0.4 - 0.015) / 4.4e-5 - 1000.0)
+    assert half[1] == pytest.approx((0.03 + 8e-6 * half[0]) * np.sqrt(0.75) / 4.4e-5)
 
 
 def test_a_motion_that_fits_raises_nothing():
@@ -352,3 +367,15 @@ def test_a_current_at_its_sensors_limit_is_frozen_whatever_that_is(limit):
     w.c["limit"] = w.c["largest"] = limit
     assert w.pass_by(1, speed=50.0, current=-limit) == TORQUE_FROZEN
     assert w.pass_by(1, speed=50.0, current=0.9 * limit) == AGREE
+
+
+def test_a_current_in_coarse_steps_is_not_frozen_where_it_repeats():
+    """Of one that repeats in nine samples of ten fifteen times as many repetitions are as rare as of a fine one."""
+    w = Watched()
+    rng = np.random.default_rng(2)
+    verdicts = {
+        w.pass_by(rng.geometric(0.1), speed=1.0, current=0.01 * step) for step in rng.permuted(np.arange(400) % 7)[50:]
+    }
+    assert w.c["current_flickered"][0] > 50 and np.array_equal([*verdicts], [AGREE]) and w.c["limit"][0] == 0.0
+    assert w.pass_by(120, speed=1.0, current=1.0) == AGREE
+    assert w.pass_by(120, speed=1.0, current=1.0) == TORQUE_FROZEN, "one that repeats on and on still is"

@@ -48,6 +48,17 @@ def _in_batches(columns):
     return columns | {"time_s": columns["time_s"][ends] + 5e-5 * (row % 5)}
 
 
+def _since_the_row_before(jitter_s):
+    """The time since the row before in place of the time, a first one of none."""
+    rng = np.random.default_rng(3)
+
+    def change(columns):
+        times = columns["time_s"] + jitter_s * rng.random(len(columns["time_s"]))
+        return columns | {"time_s": np.diff(times, prepend=times[0])}
+
+    return change
+
+
 def _shuffled(columns):
     rows = np.arange(len(columns["time_s"]))
     rows[100:105] = rows[100:105][::-1]
@@ -61,10 +72,12 @@ def _shuffled(columns):
         (_coarse(0.010), "stamps come in bunches, one every 10 ms", 0.0015),
         (_coarse(0.005), "stamps come in bunches, one every 5 ms", 0.0015),
         (_coarse(0.0156), "stamps come in bunches, one every 15.6 ms", 0.0015),
+        (_since_the_row_before(0.0), "time_s holds the time since the row before: added up", 0.0001),
+        (_since_the_row_before(0.0005), "time_s holds the time since the row before: added up", 0.0015),
         (_in_batches, "stamps come in bunches, one every 19.8 ms", 0.0015),
         (_shuffled, "", 0.0001),
     ],
-    ids=["twice", "10 ms", "5 ms", "15.6 ms", "batches", "out of order"],
+    ids=["twice", "10 ms", "5 ms", "15.6 ms", "steps", "jittered steps", "batches", "out of order"],
 )  # fmt: skip
 def test_stamps_of_recorders_are_put_right(columns, tmp_path, capsys, change, said, most_s):
     """Sample by sample the log is the one with right stamps, but for a delay that all its signals share."""

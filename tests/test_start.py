@@ -39,6 +39,10 @@ def _unknown(estimates):
     return (estimates["reasons"] & r.CONTACT_UNCERTAIN) != 0
 
 
+def _rms(values):
+    return np.sqrt(np.mean(values**2))
+
+
 def _covered(estimates, force):
     return np.all(np.abs(estimates["force"] - force) < 3.0 * estimates["sigma"])
 
@@ -410,6 +414,20 @@ def test_who_closes_through_a_third_of_the_clearance_without_any_force_was_relea
     assert s["unknown"] != known
     if known:
         assert s["contact_angle"] == pytest.approx(begun + p["clearance"])
+
+
+@pytest.mark.parametrize("status", [False, True])
+def test_while_only_the_contact_is_unknown_friction_follows_the_motion(p, status):
+    """A brake that starts on its way and never stands released: the torque less the friction of its motion, not all of it."""
+    way = np.concatenate([brake.clamp(p, 12.0, 4.0), brake.clamp(p, 12.0, 4.0)[::-1]])
+    rows, force = brake.samples(p, way)
+    rows, force = rows[300:].copy(), force[300:]
+    rows["dt"][0], rows["has_status"], rows["brake_request"] = 0.0, status, 1000.0
+    estimates = estimate(rows, p)
+    moving = _unknown(estimates) & (np.abs(rows["speed"]) > 1.0) & (np.arange(len(rows)) > 100)
+    friction = (p["offset_friction"] + p["load_friction"] * force) / p["gear_gain"]
+    assert moving.sum() > 1000 and _rms((estimates["force"] - force)[moving]) < 0.3 * _rms(friction[moving])
+    assert _covered(estimates, force)
 
 
 def test_a_torque_at_power_on_may_be_a_clamped_brake_or_an_offset_of_as_much(p, unknown):

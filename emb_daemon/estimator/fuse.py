@@ -31,7 +31,7 @@ from emb_daemon.estimator.hypotheses import (
     unproven,
     weigh,
 )
-from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, crept, disc_warmth
+from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, SELF_LOCKING, crept, disc_warmth
 from emb_daemon.estimator.rewind import keep
 from emb_daemon.estimator.status import (
     ANGLE_LATE,
@@ -91,6 +91,7 @@ from emb_daemon.models.plausibility import (
     count_contradiction,
     disbelieve_resolver,
     due,
+    force_beside_friction,
     force_of_torque_alone,
     hold,
     smoothed_sigma,
@@ -121,6 +122,10 @@ _TOLD_CYCLES = 2.0
 #: Time for which an unexplained error of the torque is constant, s: until temperature and force of the brake are others, which
 #: takes some stops.
 _LASTS_S = 10.0
+#: Share of the force, as standard deviation of the stiffness path, from which it tells none. A curve that is not measured up
+#: to the largest force is given one of all of it at most (`identify`); as much again are errors that logs have shown. Errors
+#: of that size last, and what motor and friction would learn beside them is wrong.
+_TELLS_NOTHING = sqrt(2.0)
 #: Way of a whole stroke, over which counts are lost in the same direction, as time at the motor's maximum speed, s.
 _STROKE_S = 0.25
 #: Share of the clearance by which pads are certainly apart: the motor must have gone back so far before a jump is proven, and
@@ -292,7 +297,7 @@ def fuse(
     out.innovation = out.innovation_sigma = np.nan
     out.torque_sigma = turning_sigma = standing_sigma = np.inf
     if np.isfinite(torque):
-        trusted = s.plausibility.verdict == AGREE and not s.unknown and not out_of_step(s.alignment)
+        trusted = s.plausibility.verdict == AGREE and not s.unknown and not out_of_step(s.alignment) and _tells(p)
         if trusted != s.trusted:
             # What the alternatives learned around a sensor's fault is not due to the brake.
             open_all(s, p)
@@ -304,7 +309,7 @@ def fuse(
         # At rest friction's error is constant: neither noise nor new information.
         if trusted and m.angle != s.angle and out.innovation_sigma < _TELLING * p.maximum_force:
             remember(s.consistency, out.innovation, out.innovation_sigma, m.dt)
-        s.torque_age = 0.0 if trusted else s.torque_age + m.dt
+        s.torque_age = 0.0 if trusted or not _tells(p) else s.torque_age + m.dt
         fold(s, warmth, True)
         stops = s.stops
         if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
@@ -395,6 +400,27 @@ def _torque_alone(s, p, m):
 
 
 @njit
+def _tells(p):
+    """Whether the stiffness path tells a force at all, by its own calibration."""
+    return p.stiffness_relative_sigma < _TELLS_NOTHING
+
+
+@njit
+def _torque_beside_motion(s, p, m, friction_variance):
+    """Clamp force and its standard deviation (N) by the torque and by the motion that friction follows, while the contact
+    angle says nothing; ``friction_variance`` of the friction state, 1 without a torque."""
+    slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
+    gain, load, coulomb = _gear(s, p, m, s.error, slope)
+    P = s.covariance
+    if gain + load * s.friction_mean < SELF_LOCKING * gain:
+        friction_variance = 1.0
+    force, sigma = force_beside_friction(s.plausibility, s.friction_mean, friction_variance, gain, load, coulomb, spring)
+    load_sigma = sqrt(P[COULOMB, COULOMB] + sq(force) * P[LOAD, LOAD] + P[OFFSET, OFFSET]) / gain
+    lasting = p.torque_lasting_sigma * force
+    return force, hypot(hypot(sigma, load_sigma), hypot(lasting, hypot(slope_unsure * (force + spring), spring_unsure)))
+
+
+@njit
 def _standing_sigmas(s, p, m):
     """Standard deviations (N m) of friction that holds a standing motor, and of what an uneven disc changes the load by."""
     P, load = s.covariance, max(s.force + s.spring_force, 0.0) * s.gear_slope
@@ -438,9 +464,12 @@ def _facts_of_torque(s, p):
 
 
 @njit
-def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_sigma: float, out: Record) -> int:
+def take_sides(
+    s: Record, p: Record, m: Record, turning_sigma: float, standing_sigma: float, friction_variance: float, out: Record
+) -> int:  # fmt: skip
     """Where the paths contradict each other, use the one that is not implausible; returns the facts. ``turning_sigma`` and
-    ``standing_sigma`` N m, as `fuse` returns them."""
+    ``standing_sigma`` N m, as `fuse` returns them; ``friction_variance`` of the friction state, 1 if the torque path says
+    nothing."""
     c = s.plausibility
     force, sigma, torque, gain, load, coulomb = _torque_alone(s, p, m)
     accelerating = p.inertia * (m.speed - s.speed) / m.dt if m.dt > 0.0 else 0.0
@@ -467,6 +496,9 @@ def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_s
     facts = _facts_of_torque(s, p)
     # A latched brake needs no current: the torque alone then says that nothing is known.
     latched = 0.5 * p.maximum_force if not m.has_status or m.park_brake != 0.0 else 0.0
+    if (s.unknown or not _tells(p)) and c.verdict == AGREE and swings == 0:
+        # What force belongs to the angle is unknown, but friction follows its motion.
+        force, sigma = _torque_beside_motion(s, p, m, friction_variance)
     if s.unknown:
         c.contradiction = 0.0
         if s.seen:
@@ -496,7 +528,7 @@ def take_sides(s: Record, p: Record, m: Record, turning_sigma: float, standing_s
         facts |= CURRENT_IMPLAUSIBLE
     elif c.verdict != AGREE:
         facts |= PATHS_CONTRADICT
-    elif s.contact.lost and out.stiffness_sigma > out.torque_sigma:
+    elif (s.contact.lost and out.stiffness_sigma > out.torque_sigma) or (np.isfinite(out.torque_sigma) and not _tells(p)):
         out.force, out.sigma = force, sigma
         facts |= CONTACT_SOUGHT
     return facts

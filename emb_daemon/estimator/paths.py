@@ -29,7 +29,7 @@ ONE_CYCLE_S = 1.5 * CYCLE_S
 #: Vibration dissolves what is known of the friction state at this rate while the motor stands, 1/s.
 DISSOLVING_PER_S = 0.05
 #: Torque force is unusable where its denominator nears zero (self-locking), as a share of the gear gain.
-_SELF_LOCKING = 0.2
+SELF_LOCKING = 0.2
 #: Standard deviations of the way that noisy speeds add up to from which it is one.
 _CERTAINLY = 3.0
 #: Share of friction's turning over that counts as its standard deviation where it is not known whether the gear slides: of all
@@ -319,7 +319,7 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     middle, slope = turned(s, p, read - 0.5 * travel)
     s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
     leverage = (p.gear_gain * s.gear_gain + p.load_friction * s.gear_friction * mean) * slope
-    if not m.has_current or m.dt <= 0.0 or leverage < _SELF_LOCKING * p.gear_gain * slope:
+    if not m.has_current or m.dt <= 0.0 or leverage < SELF_LOCKING * p.gear_gain * slope:
         return np.nan, leverage, 1.0
     s.motor_torque = effects.motor_torque(
         e, state, m, p.torque_constant, angle, travel, mean_speed, s.disc, s.temperature_known

@@ -203,7 +203,7 @@ def _advance(s, p, m, angle, speed, out):
         force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
         out.torque_force = max(force, 0.0)
         out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
-    facts = take_sides(s, p, m, turning_sigma, standing_sigma, out)
+    facts = take_sides(s, p, m, turning_sigma, standing_sigma, friction_variance if np.isfinite(torque) else 1.0, out)
     by_torque = facts & (RESOLVER_IMPLAUSIBLE | CONTACT_UNKNOWN | CONTACT_SOUGHT) != 0
     if (s.alignment.delay != 0.0 or s.alignment.lag < 0.0) and not by_torque:
         _lead(s, p, m, angle, speed, out)

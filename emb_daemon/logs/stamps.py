@@ -13,6 +13,9 @@ _BACK_NS = 1_000_000_000
 #: Least share of the values between two steps back that makes them the recording; other values were stamped before a clock was
 #: set.
 _ONE_RECORDING = 0.99
+#: Largest share of its range that a column of times between rows goes on by from its first to its last quarter, where a clock
+#: does by three quarters; and least share of its steps that go back, where in noise a half do and in a clock almost none.
+_NO_CLOCK = 0.25
 #: Share of the mean period up to which two stamps count as one: jitter leaves more, a gateway or a burst from a queue less.
 _ONE = 0.2
 #: Least shares of steps in motion that are that short, and that are zero, for stamps to count as bunched; a sender at random
@@ -41,6 +44,17 @@ _LEAST_FILLED, _JUMPS, _ANYWHERE = 50, 3.0, 0.25
 _LEAST_BITS, _BETWEEN, _ASTRAY = 12, 0.25, 0.01
 #: Samples that a value is held for, up to which the number has to be whole: by chance all changes are in step with one or two.
 _WHOLE = 4
+
+
+def since_the_row_before(stamps: np.ndarray) -> bool:
+    """Whether a column of times, shape (n,), in any unit, holds the time since the row before: a clock goes on, while these
+    end where they began, and go back as often as not or are all but constant."""
+    quarter = len(stamps) // 4
+    if quarter < _FEWEST // 4 or np.min(stamps) < 0.0 or np.ptp(stamps) == 0.0:
+        return False
+    went = abs(float(np.median(stamps[-quarter:]) - np.median(stamps[:quarter])))
+    spread = float(np.ptp(np.quantile(stamps, (0.05, 0.95))))
+    return went <= _NO_CLOCK * spread and (spread == 0.0 or bool(np.mean(np.diff(stamps) < 0.0) > _NO_CLOCK))
 
 
 def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +88,7 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
     if len(steps) < 2:
         return times, rows
     if times[-1] == times[0]:
-        raise InputError(f"{source}: {len(times)} values, all of them of one time")
+        raise InputError(f"{source}: {len(times)} values, all of them of one time; of rows so far apart state `rate_Hz`")
     # A clock that counts whole seconds gives most rows the stamp of the row before them.
     going_on = steps <= _PAUSE * np.quantile(steps[steps > 0], _ORDINARY)
     mean = float(np.mean(steps[going_on]))

@@ -15,7 +15,7 @@ from emb_daemon.errors import InputError, tell
 from emb_daemon.logs import arrays
 from emb_daemon.logs.mapping_file import Time
 from emb_daemon.logs.read import ZIP, ending_of_content, log_ending, needs_extra, read_file, unpack
-from emb_daemon.logs.stamps import LATEST_S, in_time
+from emb_daemon.logs.stamps import LATEST_S, in_time, since_the_row_before
 from emb_daemon.logs.text_tables import DECIMAL, LISTED, PREAMBLE, UNIT, place_of, read_text, some_of
 from emb_daemon.wire.units import UNITS, stated_in
 
@@ -145,7 +145,10 @@ def _seconds(path: str, table, time) -> np.ndarray:
     times = np.array(_numbers(path, table, time.signal), float)
     is_clock = _is_clock(table[time.signal])
     known = np.isfinite(times)
-    if is_clock or np.all(times[known] == np.rint(times[known])):
+    if not is_clock and since_the_row_before(times[known]):
+        tell(f"{path}: {time.signal} holds the time since the row before: added up")
+        times[known] = np.cumsum(times[known])
+    elif is_clock or np.all(times[known] == np.rint(times[known])):
         times[known] = _going_on(times[known], _CLOCKS_S if is_clock else _COUNTERS)
     # Times of a clock are in seconds already.
     if is_clock:

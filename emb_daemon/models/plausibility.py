@@ -12,7 +12,7 @@ samples end it. Which path is wrong is decided by the sensor that only one of th
 Otherwise it is undecided: the estimate goes on with the stiffness path, and its standard deviation covers the difference.
 """
 
-from math import exp, sqrt
+from math import exp, log, sqrt
 
 import numpy as np
 
@@ -21,7 +21,9 @@ from emb_daemon.jit import Record, fields, hypot, njit
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
 #: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the integrated speed.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
-#: changed. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
+#: changed; ``current_repeated``: in which it repeated while the motor turned, but not for so long that it was frozen.
+#: ``idled``: ``idle`` as of a fine current, which repeats in one sample of five. ``frozen_s``: time for which the resolver has
+#: been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``steady``: the same less what
 #: accelerates the motor. The angle has stood at ``held_angle`` (rad) for ``held`` samples; meanwhile ``steady`` swung
 #: ``swings`` times, the last time upwards (``swing`` 1) or downwards (-1); ``held_low``, ``held_high``: its least and largest
@@ -34,8 +36,8 @@ PLAUSIBILITY = np.dtype(
         ("contradiction", "f8"),
         ("verdict", "i8"),
         ("apart", "f8"),
-        *fields("i8", "still idle alike flickered current_flickered"),
-        *fields("f8", "current frozen_s"),
+        *fields("i8", "still idle alike flickered current_flickered current_repeated"),
+        *fields("f8", "idled current frozen_s"),
         ("averaged", "?"),
         *fields("f8", "torque_mean torque_variance steady held_angle held_low held_high due_acceleration due_speed due_angle"),
         *fields("i8", "held swing swings pinned"),
@@ -60,6 +62,9 @@ _REPEATED, _NEVER_REPEATED = 8, 50
 #: A speed that changed in `_FLICKERED` samples while the angle stood is noise, which does not repeat to the bit `_FROZEN`
 #: times in a row: with one repetition in five by chance, once in 1e8.
 _FLICKERED, _FROZEN = 50, 12
+#: Share of samples in which a fine current repeats to the bit. One in steps that are coarse beside its noise does more often,
+#: and to repeat on and on is as rare for it only after so many times more samples as the logarithms of both shares say.
+_BY_CHANCE = 0.2
 #: Time constant over which angle and integrated speed are compared (s), and difference (rad) that is a fault, in addition to
 #: what a signal delay of `_DELAY_S` causes. A resolver is used again after `_RETURNED` samples in which the angle moved and
 #: followed the speed within `_ALIKE_RAD`.
@@ -114,23 +119,23 @@ def watch(
             # The sum was the resolver's fault, and must not count against the current.
             believe_resolver(c)
         return c.verdict
-    patience = 1.0 if confirmed or max(c.still, c.idle) >= _REPEATED else _UNCONFIRMED
+    patience = 1.0 if confirmed or max(c.still, c.idled) >= _REPEATED else _UNCONFIRMED
     disagree = c.contradiction > (patience * _RAISE if was == AGREE else _CLEAR)
     if travel == 0.0 and m.speed != speed_before:
         c.flickered += 1
     repeated = c.still >= (_FROZEN if c.flickered >= _FLICKERED else _NEVER_REPEATED)
     repeated = repeated and (m.speed != 0.0 or c.flickered >= _FLICKERED)
-    if repeated or abs(c.apart) > _APART_RAD + delay or (disagree and c.still >= _REPEATED and c.idle < _REPEATED):
+    if repeated or abs(c.apart) > _APART_RAD + delay or (disagree and c.still >= _REPEATED and c.idled < _REPEATED):
         c.verdict = STIFFNESS_WRONG
         c.frozen_s = c.still * m.dt
         c.alike = 0
         return c.verdict
-    repeated = c.idle >= _FROZEN and c.current_flickered >= _FLICKERED and c.still < _FROZEN
+    repeated = c.idled >= _FROZEN and c.current_flickered >= _FLICKERED and c.still < _FROZEN
     if repeated or (m.has_current and 0.0 < c.limit == abs(m.current_q)):
         c.verdict = TORQUE_FROZEN
     elif not disagree:
         c.verdict = AGREE
-    elif c.idle >= _REPEATED and c.still < _REPEATED:
+    elif c.idled >= _REPEATED and c.still < _REPEATED:
         c.verdict = TORQUE_FROZEN
     elif was in (TORQUE_WRONG, TORQUE_FROZEN) or past_contact < -_CLEAR_OF_CONTACT * contact_sigma:
         c.verdict = TORQUE_WRONG
@@ -152,18 +157,30 @@ def _count_repetitions(c, m, travel, step, delay, speed_before):
     if m.has_current:
         c.idle = c.idle + 1 if m.current_q == c.current else 0
         c.current_flickered += c.idle == 0
+        c.current_repeated += c.idle > 0 and c.idled < _FROZEN and c.still < _FROZEN
+        stretch = _stretch(c)
+        c.idled = c.idle / stretch
         c.current = m.current_q
-        _look_for_limit(c, m.current_q, travel)
+        _look_for_limit(c, m.current_q, travel, stretch)
 
 
 @njit
-def _look_for_limit(c, current, travel):
+def _stretch(c):
+    """Factor on the number of repetitions that are as rare for this current as for a fine one."""
+    if c.current_flickered < _FLICKERED:
+        return 1.0
+    share = c.current_repeated / (c.current_repeated + c.current_flickered)
+    return log(_BY_CHANCE) / log(max(share, _BY_CHANCE))
+
+
+@njit
+def _look_for_limit(c, current, travel, stretch):
     """Learn the current (A) beyond which the sensor does not measure: one that repeats to the bit while the motor turns. A
     limit that a later ``current`` exceeds is forgotten, and the sensor is coarse."""
     c.pinned = c.pinned + 1 if c.idle > 0 and abs(travel) > _STANDS_RAD else 0
     needed = _PINNED if c.coarse or abs(current) < c.largest else _PINNED_AT_LARGEST
     c.largest = max(c.largest, abs(current))
-    if c.pinned >= needed and c.current_flickered >= _FLICKERED:
+    if c.pinned >= needed * stretch and c.current_flickered >= _FLICKERED:
         c.limit = abs(current)
     elif abs(current) > c.limit:
         c.coarse = c.coarse or c.limit > 0.0
@@ -174,7 +191,7 @@ def _look_for_limit(c, current, travel):
 def frozen(c: Record) -> bool:
     """Whether one sensor repeats its value while the other changes: then their difference is no evidence about the contact
     angle."""
-    return c.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN) or (c.still > 0) != (c.idle > 0) or c.still < _REPEATED <= c.idle
+    return c.verdict in (STIFFNESS_WRONG, TORQUE_FROZEN) or (c.still > 0) != (c.idled >= 1.0) or c.still < _REPEATED <= c.idled
 
 
 @njit
@@ -290,10 +307,26 @@ def force_of_torque_alone(
     if has_current:
         # The first torque counts in full, because the brake may be clamped at the start.
         share = 1.0 - exp(-dt / _AVERAGED_S) if c.averaged else 1.0
-        c.averaged = True
+        if not c.averaged:
+            c.averaged, c.steady = True, torque
         off = torque - c.torque_mean
         c.torque_mean += share * off
         c.torque_variance = (1.0 - share) * (c.torque_variance + share * off * off)
     force = max(c.torque_mean / gear_gain - spring, 0.0)
     friction = offset_friction + load_friction * force
     return force, sqrt(friction * friction + c.torque_variance) / gear_gain
+
+
+@njit
+def force_beside_friction(
+    c: Record, state: float, variance: float, gear_gain: float, load_friction: float, offset_friction: float, spring: float
+) -> tuple[float, float]:
+    """The same beside a resolver whose motion is believed: inertia is taken out, and of friction what its ``state`` in [-1, 1]
+    and the state's ``variance`` tell (`models.torque.friction_state`).
+
+    The variance is the chance that the state has been forgotten, and that friction then has either direction."""
+    mean = (1.0 - variance) * state
+    leverage = gear_gain + load_friction * mean
+    force = max((c.steady - offset_friction * mean) / leverage - spring, 0.0)
+    unsure = (offset_friction + load_friction * force) * sqrt(variance + variance * (1.0 - variance) * state * state)
+    return force, hypot(unsure, sqrt(c.torque_variance)) / leverage

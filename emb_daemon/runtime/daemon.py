@@ -126,7 +126,7 @@ def _compile_fusion(scratch: Pipeline) -> None:
     state, parameters, sample, estimate = (
         records[0] for records in (scratch.states, scratch.parameters, scratch.samples, scratch.estimates)
     )
-    compile_within(take_sides, state, parameters, sample, 0.0, 0.0, estimate)
+    compile_within(take_sides, state, parameters, sample, 0.0, 0.0, 1.0, estimate)
     compile_within(fuse, state, parameters, sample, 0.0, 0.0, 0.0, 0.0, estimate)
 
 
