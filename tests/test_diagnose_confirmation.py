@@ -130,12 +130,18 @@ def test_what_a_fit_has_left_at_nothing_is_no_effect(viscous):
     assert selection.model.of_effect("viscous_friction") and not revise(stuck).accepted
 
 
-def test_what_ends_at_the_bound_of_physics_may_be_another_cause(viscous):
-    """Of 3e-4 no more than two thirds may be viscous, or all of it: a term says all, which is not asked where all may be."""
+def test_what_ends_at_the_bound_of_physics_may_be_another_cause(viscous, monkeypatch):
+    """Of 3e-4 no more than two thirds may be viscous, or all of it: a term says all, which is not asked where all may be, nor
+    taken for more causes than there were; and viscous friction is no name for it."""
     selection, _, _ = viscous
     channel = selection.candidates["viscous_friction"].channel
     bare = selection.without("viscous_friction", "to ask it again")
     [viscous_friction] = [effect for effect in REGISTRY if effect.name == "viscous_friction"]
+    find_known = grammar.find_known
+
+    def known(bare, channel):
+        return [c for c in find_known(bare, channel) if c.effect is viscous_friction]
+
     coordinates = dict(bare.screening.coordinates)
     [amplitude] = coordinates["viscous_friction"].values()
     found, left = {}, {}
@@ -145,6 +151,13 @@ def test_what_ends_at_the_bound_of_physics_may_be_another_cause(viscous):
         asked = bare.entered([candidate])
         assert asked.accepted == ["viscous_friction"]
         found[high], left[high] = grammar._without_shadows(asked, asked, channel), asked.model.noise(channel)
+        if high == 2e-4:
+            with monkeypatch.context() as patched:
+                patched.setattr(grammar, "find_known", known)
+                patched.setattr(grammar, "_is_shorter", lambda *_: False)
+                assert grammar._called_by_name(found[high], channel).accepted == found[high].accepted
+                patched.setattr(grammar, "_causes", lambda selection, _, one=asked: {1} if selection is one else {1, 2})
+                assert grammar._without_shadows(asked, asked, channel) is asked
     bare.screening.coordinates.update(coordinates)
     [term] = found[2e-4].accepted
     assert "motor_speed" in term and found[2e-4].model.noise(channel) < left[2e-4]
