@@ -415,9 +415,10 @@ def _torque_beside_motion(s, p, m, friction_variance):
     if gain + load * s.friction_mean < SELF_LOCKING * gain:
         friction_variance = 1.0
     force, sigma = force_beside_friction(s.plausibility, s.friction_mean, friction_variance, gain, load, coulomb, spring)
-    load_sigma = sqrt(P[COULOMB, COULOMB] + sq(force) * P[LOAD, LOAD] + P[OFFSET, OFFSET]) / gain
+    of_motor = P[OFFSET, OFFSET] + sq(s.plausibility.steady) * P[GAIN, GAIN] + sq(m.speed) * P[VISCOUS, VISCOUS]
+    known = sqrt(P[COULOMB, COULOMB] + sq(force) * P[LOAD, LOAD] + of_motor) / gain
     lasting = p.torque_lasting_sigma * force
-    return force, hypot(hypot(sigma, load_sigma), hypot(lasting, hypot(slope_unsure * (force + spring), spring_unsure)))
+    return force, hypot(hypot(sigma, known), hypot(lasting, hypot(slope_unsure * (force + spring), spring_unsure)))
 
 
 @njit
