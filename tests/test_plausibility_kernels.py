@@ -369,13 +369,14 @@ def test_a_current_at_its_sensors_limit_is_frozen_whatever_that_is(limit):
     assert w.pass_by(1, speed=50.0, current=0.9 * limit) == AGREE
 
 
-def test_a_current_in_coarse_steps_is_not_frozen_where_it_repeats():
-    """Of one that repeats in nine samples of ten fifteen times as many repetitions are as rare as of a fine one."""
+@pytest.mark.parametrize(("most", "coarse"), [(1, True), (6, False)])
+def test_a_current_in_coarse_steps_is_not_frozen_where_it_repeats(most, coarse):
+    """Of one that repeats in nine samples of ten fifteen times as many repetitions are as rare as of a fine one; not of one
+    that changes by several steps, of which the sender has no newer value."""
     w = Watched()
     rng = np.random.default_rng(2)
-    verdicts = {
-        w.pass_by(rng.geometric(0.1), speed=1.0, current=0.01 * step) for step in rng.permuted(np.arange(400) % 7)[50:]
-    }
-    assert w.c["current_flickered"][0] > 50 and np.array_equal([*verdicts], [AGREE]) and w.c["limit"][0] == 0.0
-    assert w.pass_by(120, speed=1.0, current=1.0) == AGREE
-    assert w.pass_by(120, speed=1.0, current=1.0) == TORQUE_FROZEN, "one that repeats on and on still is"
+    steps = np.cumsum(np.where(rng.random(400) < 0.5, 1, -1) * rng.integers(1, most, 400, endpoint=True))
+    verdicts = [w.pass_by(rng.geometric(0.1), speed=1.0, current=0.01 * step) for step in steps]
+    assert w.c["current_flickered"][0] > 50 and (set(verdicts) == {AGREE}) == coarse and w.c["limit"][0] == 0.0
+    assert (w.pass_by(120, speed=1.0, current=2.0) == AGREE) == coarse
+    assert w.pass_by(120, speed=1.0, current=2.0) == TORQUE_FROZEN, "one that repeats on and on still is"

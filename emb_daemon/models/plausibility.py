@@ -21,7 +21,8 @@ from emb_daemon.jit import Record, fields, hypot, njit
 #: ``contradiction``: summed squares. ``apart`` rad: angle less integrated speed, leaky. ``still``, ``idle``: samples in which
 #: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the integrated speed.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
-#: changed; ``current_repeated``: in which it repeated while the motor turned, but not for so long that it was frozen.
+#: changed, ``current_stepped`` of them by ``current_step`` A, the least so far; ``current_repeated``: in which it repeated
+#: while the motor turned, but not for so long that it was frozen.
 #: ``idled``: ``idle`` as of a fine current, which repeats in one sample of five. ``frozen_s``: time for which the resolver has
 #: been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``steady``: the same less what
@@ -36,8 +37,8 @@ PLAUSIBILITY = np.dtype(
         ("contradiction", "f8"),
         ("verdict", "i8"),
         ("apart", "f8"),
-        *fields("i8", "still idle alike flickered current_flickered current_repeated"),
-        *fields("f8", "idled current frozen_s"),
+        *fields("i8", "still idle alike flickered current_flickered current_stepped current_repeated"),
+        *fields("f8", "idled current current_step frozen_s"),
         ("averaged", "?"),
         *fields("f8", "torque_mean torque_variance steady held_angle held_low held_high due_acceleration due_speed due_angle"),
         *fields("i8", "held swing swings pinned"),
@@ -65,6 +66,8 @@ _FLICKERED, _FROZEN = 50, 12
 #: Share of samples in which a fine current repeats to the bit. One in steps that are coarse beside its noise does more often,
 #: and to repeat on and on is as rare for it only after so many times more samples as the logarithms of both shares say.
 _BY_CHANCE = 0.2
+#: Share of a step of the current that a smaller step is below, whatever the rounding of both.
+_LESS = 0.75
 #: Time constant over which angle and integrated speed are compared (s), and difference (rad) that is a fault, in addition to
 #: what a signal delay of `_DELAY_S` causes. A resolver is used again after `_RETURNED` samples in which the angle moved and
 #: followed the speed within `_ALIKE_RAD`.
@@ -157,6 +160,7 @@ def _count_repetitions(c, m, travel, step, delay, speed_before):
     if m.has_current:
         c.idle = c.idle + 1 if m.current_q == c.current else 0
         c.current_flickered += c.idle == 0
+        _count_steps(c, abs(m.current_q - c.current))
         c.current_repeated += c.idle > 0 and c.idled < _FROZEN and c.still < _FROZEN
         stretch = _stretch(c)
         c.idled = c.idle / stretch
@@ -165,9 +169,20 @@ def _count_repetitions(c, m, travel, step, delay, speed_before):
 
 
 @njit
+def _count_steps(c, change):
+    """Count what changes the current, by ``change`` A, as little as anything did."""
+    if change == 0.0:
+        return
+    if c.current_step == 0.0 or change < _LESS * c.current_step:
+        c.current_step, c.current_stepped = change, 0
+    c.current_stepped += _LESS * change < c.current_step
+
+
+@njit
 def _stretch(c):
-    """Factor on the number of repetitions that are as rare for this current as for a fine one."""
-    if c.current_flickered < _FLICKERED:
+    """Factor on the number of repetitions that are as rare for this current as for a fine one. One that repeats because its
+    steps are coarse mostly changes by one step; one whose sender has no newer value changes by many."""
+    if c.current_flickered < _FLICKERED or c.current_stepped < 0.5 * c.current_flickered:
         return 1.0
     share = c.current_repeated / (c.current_repeated + c.current_flickered)
     return log(_BY_CHANCE) / log(max(share, _BY_CHANCE))
