@@ -59,6 +59,7 @@ _SHAPES = 3
 #: Share of what a term does (RMS) that one of another place must gain beside it: a power, or a memory, that is nearly right is
 #: wrong by some per cent, which then look like another cause.
 _BESIDE = 0.1
+#: Why an effect that ends at a bound was refused: it is no name for the terms in its place either.
 _AT_LIMIT = "physics allows no more of it, and terms leave less"
 
 

@@ -22,9 +22,8 @@ from emb_daemon.jit import Record, fields, hypot, njit
 #: angle and speed, or the current, repeated to the bit. ``alike``: samples in which the angle moved as the integrated speed.
 #: ``flickered``: samples in which the speed changed while the angle stood; ``current_flickered``: in which the current
 #: changed, ``current_stepped`` of them by ``current_step`` A, the least so far; ``current_repeated``: in which it repeated
-#: while the motor turned, but not for so long that it was frozen.
-#: ``idled``: ``idle`` as of a fine current, which repeats in one sample of five. ``frozen_s``: time for which the resolver has
-#: been implausible. ``verdict``: as below. ``torque_mean``,
+#: while the motor turned, but not for so long that it was frozen. ``idled``: ``idle`` as of a fine current, which repeats in
+#: one sample of five. ``frozen_s``: time for which the resolver has been implausible. ``verdict``: as below. ``torque_mean``,
 #: ``torque_variance``: motor torque (N m), smoothed; ``averaged``: whether there was one; ``steady``: the same less what
 #: accelerates the motor. The angle has stood at ``held_angle`` (rad) for ``held`` samples; meanwhile ``steady`` swung
 #: ``swings`` times, the last time upwards (``swing`` 1) or downwards (-1); ``held_low``, ``held_high``: its least and largest
