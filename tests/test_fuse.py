@@ -102,6 +102,21 @@ def test_what_holds_a_standing_motor_is_as_unsure_as_its_friction(p, s, m):
         assert (fuse._standing_sigmas(s, p, m)[1] > 0.0) == swings
 
 
+def test_a_torque_beside_a_known_motion_is_as_unsure_as_what_it_is_made_of(p, s, m):
+    """Offset, torque constant, both frictions and the viscous one, each alone; 0.5 N m at 40 rad/s."""
+    s["plausibility"]["steady"], s["spring_force"] = 0.5, 0.0
+    s["gear_gain"] = 1.0
+    gain, force = 1.3 * p["gear_gain"], fuse._torque_beside_motion(s, p, m, 0.0)[0]
+    shares = {fuse.OFFSET: 1.0, fuse.GAIN: 0.5, fuse.COULOMB: 1.0, fuse.LOAD: force, fuse.VISCOUS: 40.0}
+    s["covariance"] = 0.0
+    alone = fuse._torque_beside_motion(s, p, m, 0.0)[1]
+    for state, share in shares.items():
+        s["covariance"] = 0.0
+        s["covariance"][state, state] = 1e-4 / share**2
+        sigma = fuse._torque_beside_motion(s, p, m, 0.0)[1]
+        assert np.sqrt(sigma**2 - alone**2) == pytest.approx(0.01 / gain)
+
+
 def test_pads_that_stand_keep_the_force_that_their_way_there_has_left_them(parameters, s, m):
     """Of pads with hysteresis alone: one that has been released by a radian has less force than one that closes, for good."""
     p = brake.ideal(parameters)
