@@ -103,9 +103,8 @@ def answers(frames: list[Frame]) -> list[bytes]:
 
 
 def differ(live: list[bytes], other: list[bytes]) -> list[bytes]:
-    """Live answers that differ from others. Where the kernel was held up between stamping a frame and queueing it the daemon
-    knows another time of it than a log of the bus, and by half a cycle more or less a sample is late by one more: of one
-    in a thousand it may say another age and sigma, but never another force."""
+    """Live answers that differ from others. Where the kernel was held up for two cycles between stamping a frame and queueing
+    it, the daemon does not believe the stamp, which a log of the bus has: age and sigma may then differ, the force never."""
     assert [answer[:2] + answer[4:5] for answer in live] == [answer[:2] + answer[4:5] for answer in other]
     return [one for one, another in zip(live, other, strict=True) if one != another]
 
