@@ -1,8 +1,11 @@
 """A reload gives what a restart gives, whatever changed; signals in any number and at any moment do no harm."""
 
+import contextlib
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -15,7 +18,7 @@ from adaptkit import parked
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.memory import Memory
 from emb_daemon.calibration.configuration import Setup
-from emb_daemon.calibration.files import load_calibration, save_calibration
+from emb_daemon.calibration.files import calibration_hash, load_calibration, save_calibration
 from emb_daemon.calibration.parameters import keys, moved, parameter
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.errors import InputError
@@ -25,7 +28,9 @@ from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import city_drive, commands_of
 from emb_daemon.runtime.daemon import Daemon
+from emb_daemon.runtime.pages import Page
 from emb_daemon.runtime.rawcan import socket_pair
+from emb_daemon.runtime.reading import Reader, read_calibrations
 from emb_daemon.runtime.realtime import use_fifo
 
 CONFIG = Path(__file__).parent.parent / "config"
@@ -254,6 +259,108 @@ def test_a_storm_of_signals_stops_nothing(daemon):
         signal.signal(signal.SIGHUP, before)
     reload_now(daemon)
     assert daemon.pipeline.parameters[0] == to_parameters(SHIPPED)
+
+
+def test_what_waits_for_a_release_waits_for_what_is_being_read_too(daemon, folder):
+    """The file is changed, and changed back while the brake is clamped: the change in between is not taken."""
+    go_on, read, state = threading.Event(), daemon._files.read, daemon.pipeline.states[0]
+    state["started"] = state["contact"]["engaged"] = True
+    save_calibration(moved(SHIPPED, {"contact.clearance_rad": 7.0}), folder / "calibration.yaml")
+    daemon.reload()
+    daemon._follow_reload()
+    daemon._reader.join()
+    daemon._follow_reload()
+    assert daemon._waiting
+    daemon._files.read = lambda *arguments: (read(*arguments), go_on.wait(20.0))[0]
+    save_calibration(SHIPPED, folder / "calibration.yaml")
+    daemon.reload()
+    daemon._follow_reload()
+    state["contact"]["engaged"] = False
+    daemon._follow_reload()
+    go_on.set()
+    end_reload(daemon)
+    assert daemon.pipeline.parameters[0] == to_parameters(SHIPPED)
+
+
+@pytest.fixture
+def reader():
+    made = Reader()
+    made.begin()
+    yield made
+    made.close()
+
+
+def test_what_a_child_reads_is_what_is_read_here(reader, folder):
+    """Calibrations that differ from those in use, to the bit, and the same faults."""
+    path, in_use = folder / "emb.yaml", {"FL": calibration_hash(SHIPPED)}
+    assert reader.read(path, in_use) == read_calibrations(path, in_use, None) == {}
+    key = "contact.clearance_rad"
+    page = Page({"FL": {key: 7.1}}, in_use)
+    assert reader.read(path, in_use, page) == read_calibrations(path, in_use, page) == {"FL": moved(SHIPPED, {key: 7.1})}
+    save_calibration(moved(SHIPPED, {key: 7.0}), folder / "calibration.yaml")
+    assert reader.read(path, in_use) == {"FL": moved(SHIPPED, {key: 7.0})}
+    (folder / "calibration.yaml").write_text("format: [\n")
+    said = []
+    for read in (reader.read, read_calibrations):
+        with pytest.raises(InputError) as refused:
+            read(path, in_use, None)
+        said.append(str(refused.value))
+    assert said[0] == said[1] and "calibration.yaml" in said[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
+def test_a_signal_to_all_processes_of_that_name_does_not_end_the_one_that_reads(folder, monkeypatch, number):
+    """At any time, the first moment of its life included."""
+    fork, reader = os.fork, Reader()
+
+    def fork_and_signal():
+        if child := fork():
+            return child
+        os.kill(os.getpid(), number)
+        return 0
+
+    monkeypatch.setattr(os, "fork", fork_and_signal)
+    reader.begin()
+    os.kill(reader._child, number)
+    assert reader.read(folder / "emb.yaml", {"FL": calibration_hash(SHIPPED)}) == {}
+    assert number not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    reader.close()
+
+
+def test_while_a_child_reads_the_loop_has_the_interpreter(reader, folder):
+    """On a busy CPU a thread that reads would hold it for as long as others run, which is any time."""
+    path, in_use = folder / "emb.yaml", {"FL": calibration_hash(SHIPPED)}
+
+    def cpu_s(read):
+        begun = time.process_time()
+        assert read(path, in_use, None) == {}
+        return time.process_time() - begun
+
+    beside, here = ([cpu_s(read) for _ in range(5)] for read in (reader.read, read_calibrations))
+    assert np.median(beside) < 0.1 * np.median(here)
+
+
+def test_a_reader_that_is_gone_refuses_and_the_calibration_stays(reader, daemon, caplog):
+    """It may have ended of the file, which this process does not read then."""
+    daemon._files = reader
+    os.kill(reader._child, signal.SIGKILL)
+    reload_now(daemon)
+    assert "the old one stays in use" in caplog.text and "restart the daemon" in caplog.text
+
+
+def test_the_reader_ends_with_its_daemon():
+    """However that ends: what is left would keep its files and the service's memory."""
+    made = "import time; from emb_daemon.runtime.reading import Reader; made = Reader(); made.begin()"
+    script = f"{made}; print(made._child, flush=True); time.sleep(60)"
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    child = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    end = time.monotonic() + 10.0
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        while Path("/proc", str(child), "stat").read_text().rpartition(")")[2].split()[0] != "Z":
+            assert time.monotonic() < end, "the reader goes on"
+            time.sleep(0.01)
 
 
 def test_the_reader_thread_has_ordinary_scheduling():

@@ -32,6 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emb_daemon.jit import compiled_for_the_next_start
     from emb_daemon.runtime.daemon import Daemon
     from emb_daemon.runtime.journal import log, set_up_logging
+    from emb_daemon.runtime.reading import Reader
     from emb_daemon.runtime.realtime import set_up, settle_memory
     from emb_daemon.runtime.systemd import ServiceManager
 
@@ -39,12 +40,14 @@ def run(arguments: argparse.Namespace) -> int:
     configuration = setup.configuration
     set_up_logging(configuration.log_level)
     log.info("%s", library.description())
+    reader = Reader()
+    reader.begin()
     state = state_directory(configuration.state_directory, arguments.config.parent)
     if state:
         # Two daemons would overwrite each other's learned values.
         hold(state)
     bus, keyless = _open_bus(arguments, setup, state)
-    daemon = Daemon(setup, bus, ServiceManager(), state)
+    daemon = Daemon(setup, bus, ServiceManager(), state, reader)
     daemon.pipeline.distrust(keyless)
     if arguments.share:
         daemon.share(arguments.share)
@@ -52,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     daemon.warm_up()
     if compiled_for_the_next_start():
         log.info("kernels compiled, starting again with them: the compiler would keep twice the daemon's memory")
+        reader.close()
         _start_again()
     if arguments.share and configuration.xcp.calibrate:
         daemon.take_pages(arguments.share)
@@ -66,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         daemon.run()
     finally:
         bus.close()
+        reader.close()
     return 0
 
 

@@ -28,6 +28,7 @@ from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.changes import ChangeLog
 from emb_daemon.runtime.journal import log
 from emb_daemon.runtime.pages import PATIENCE_S, Answer, PageListener, Request, socket_path
+from emb_daemon.runtime.reading import Reader, differing
 from emb_daemon.runtime.shared import SharedEstimates
 from emb_daemon.runtime.systemd import ServiceManager
 from emb_daemon.wire import contract
@@ -137,12 +138,16 @@ class Daemon:
         setup: checked configuration.
         bus: what `runtime.bus.open_bus` or `runtime.rawcan.socket_pair` returns.
         state: folder for learned values; without one nothing is learned.
+        reader: reads calibrations again at a reload.
 
     Attributes:
         ticks, missed: periods run, and periods in which the loop did not wake.
     """
 
-    def __init__(self, setup: Setup, bus: Bus, manager: ServiceManager | None = None, state: Path | None = None):
+    def __init__(
+        self, setup: Setup, bus: Bus, manager: ServiceManager | None = None, state: Path | None = None,
+        reader: Reader | None = None,
+    ):  # fmt: skip
         self._setup = setup
         self._bus = bus
         self._manager = manager or ServiceManager(environment={})
@@ -159,6 +164,8 @@ class Daemon:
         self._estimated = self._lost = 0
         # Plain flags: an Event takes a lock, for which a signal handler could wait forever in the thread that it interrupts.
         self._stopping = self._reload_wanted = False
+        #: What reads the files, and the thread that waits for it.
+        self._files: Reader = reader or Reader()
         self._reader: threading.Thread | None = None
         #: Calibrations by corner: in use; read by the reader thread; waiting for the brake's release. The reader writes only
         #: the second, and the loop takes it over when the reader has ended.
@@ -352,8 +359,10 @@ class Daemon:
             elif self._asked is not None:
                 self._page, self._asked = self._asked, None
                 self._read_beside(self._read_calibrations, self._page)
-        for name in [name for name in self._waiting if self._is_released(name)]:
-            self._begin_anew(name, *self._waiting.pop(name))
+        if self._reader is None:
+            # What is being read is compared with what is in use, which must be the same until it has been read.
+            for name in [name for name in self._waiting if self._is_released(name)]:
+                self._begin_anew(name, *self._waiting.pop(name))
 
     def _read_beside(self, read, *arguments) -> None:
         self._reader = threading.Thread(target=read, args=arguments, name="reload", daemon=True)
@@ -389,11 +398,9 @@ class Daemon:
 
     def _read_calibrations(self, request: Request | None = None) -> None:
         """Read the files, and set the numbers of a page if one is asked for."""
+        in_use = {name: calibration_hash(calibration) for name, calibration in self._calibrations.items()}
         try:
-            setup = Setup(self._setup.path)
-            if setup.calibrations.keys() != self._setup.calibrations.keys():
-                raise InputError(f"{setup.path}: corners: a reload cannot change them; restart the daemon")
-            calibrations = request.page.apply(setup.calibrations) if request else setup.calibrations
+            changed = self._files.read(self._setup.path, in_use, request.page if request else None)
         except InputError as error:
             if request:
                 request.fault = str(error)
@@ -402,15 +409,16 @@ class Daemon:
             if request or not self._on_page:
                 return
             # A faulty file must not keep a page in use.
-            calibrations = self._of_files
+            changed = differing(self._of_files, in_use)
         waiting = {}
-        for name, calibration in calibrations.items():
-            words = {"corner": name, "calibration": calibration_hash(calibration)}
-            if words["calibration"] == calibration_hash(self._calibrations[name]):
+        for name, hashed in in_use.items():
+            if name not in changed:
+                words = {"corner": name, "calibration": hashed}
                 log.info("corner %(corner)s: calibration %(calibration)s unchanged", words, extra={"fields": words})
-            else:
-                log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
-                waiting[name] = calibration, self._adaptation.read(name, calibration) if self._adaptation else None
+                continue
+            words = {"corner": name, "calibration": calibration_hash(changed[name])}
+            log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
+            waiting[name] = changed[name], self._adaptation.read(name, changed[name]) if self._adaptation else None
         if request:
             request.read, request.fault = waiting, ""
         else:
