@@ -1,4 +1,5 @@
-"""The daemon with four corners for a given time: fails if samples are not answered or memory grows.
+"""The daemon with four corners for a given time: fails if memory grows, or if more samples are not answered than in a
+thousand, and in a thousand more for each thousandth of its periods that an empty loop beside it misses.
 
 Run as ``python tests/soak.py SECONDS``.
 """
@@ -9,6 +10,8 @@ from emb_daemon.bench.loop import measure_loop
 
 #: Growth of resident memory over the whole run that is no leak, KiB: pages touched late.
 _GROWTH_KIB = 4096
+#: Share of samples that may go unanswered.
+_UNANSWERED = 0.001
 
 
 def main() -> int:
@@ -20,7 +23,9 @@ def main() -> int:
         f"{100 * answered:.3f} % of samples answered, {last / 1024:.1f} MiB resident, {(last - first) / 1024:+.2f} MiB"
     )
     faults = []
-    if answered < 0.999:
+    # What keeps an empty loop from its CPU keeps the car and the daemon from theirs.
+    held_up = result["empty_loop"]["missed"] / max(result["ticks"], 1)
+    if answered < 1.0 - _UNANSWERED - held_up:
         faults.append("samples were not answered")
     if last - first > _GROWTH_KIB:
         faults.append("memory grew")

@@ -105,6 +105,21 @@ def test_a_j1939_group_is_heard_of_its_first_sender(tmp_path):
     assert len(samples) > 80 and samples["speed"] == pytest.approx(800.0 * np.pi / 30.0, abs=0.03)
 
 
+def test_a_speed_adds_no_way_while_the_bus_is_silent_live_as_in_a_log(tmp_path):
+    """A motor that turns at 60 rpm for two seconds, a minute without a frame, and two seconds at 60 rpm."""
+    (tmp_path / "m.dbc").write_text('VERSION ""\nBU_: T\nBO_ 33 M: 2 T\n SG_ S : 0|16@1- (0.01,0) [0|0] "rpm" T\n')
+    (tmp_path / "mapping.yaml").write_text("format: 1\ndbc: m.dbc\nsignals:\n  EMB_FL_Resolver.MotorSpeed: {signal: M.S}\n")
+    mapping, live, lines = Mapping(tmp_path / "mapping.yaml"), [], []
+    bus, data = MappedBus(_Silent(), mapping), (6000).to_bytes(2, "little")
+    for begins_ms in (1000, 63000):
+        for time_ms in range(begins_ms, begins_ms + 2004, 4):
+            live += bus.heard(can.Message(arbitration_id=33, is_extended_id=False, data=data), time_ms * 1_000_000)
+            lines.append(f"({1e-3 * time_ms:.6f}) can0 021#{data.hex()}\n")
+    (tmp_path / "a.log").write_text("".join(lines))
+    for rows in (np.array(live, FRAME), mapping.read(tmp_path / "a.log")):
+        assert np.ptp(log_of(rows).samples["angle"]) == pytest.approx(4.0 * 2.0 * np.pi, abs=0.1)
+
+
 def test_a_mapping_of_columns_is_no_bus(tmp_path):
     with pytest.raises(InputError, match="expected one with `dbc` for a live bus"):
         MappedBus(_Silent(), Mapping(foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)))

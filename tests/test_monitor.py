@@ -20,15 +20,17 @@ from emb_daemon.monitor.listener import HISTORY_S, SECOND_NS, Listener, broadcas
 from emb_daemon.monitor.view import render, sparkline, summary
 from emb_daemon.plant.records import TRUTH
 from emb_daemon.resources import resource
-from emb_daemon.wire.contract import REASONS
+from emb_daemon.wire.contract import FUSED, PREDICTED, REASONS
 
 S = SECOND_NS
 
 
-def _force(cycle: int, force_kN: float = 5.0, status: int = 0, corner: str = "FL", counter: int | None = None):
+def _force(
+    cycle: int, force_kN: float = 5.0, status: int = 0, corner: str = "FL", counter: int | None = None, source: int = 1
+):  # fmt: skip
     return wirekit.frame(
         f"EMB_{corner}_ClampForce", 100 * S + cycle * 4 * wirekit.MS, cycle % 15 if counter is None else counter, status,
-        ClampForce=force_kN, ClampForceSigma=0.12, InputCounter=3, ForceSource=1, InputAge=8,
+        ClampForce=force_kN, ClampForceSigma=0.12, InputCounter=3, ForceSource=source, InputAge=8,
     )  # fmt: skip
 
 
@@ -210,6 +212,19 @@ def test_the_demo_is_the_monitor_with_the_truth_beside_it(width, height):
         assert "23.45 kN ± 0.12" in lines[first] and "degraded" in lines[first] and "512/345 °C" in lines[first + 1]
         assert "reference 23.46 kN" in lines[first + 2] and "signal stuck" in lines[first + 3]
     assert any("simulated truth" in line for line in lines) and ("info: ready" in lines) == (height > 24)
+
+
+def test_an_estimate_of_a_sample_that_came_late_is_an_answer_and_a_prediction_is_none():
+    """The machine holds up the car's own frames; what the daemon makes of them is compared with their truth."""
+    recorder, truth = Recorder(("FL",), 1.0), np.zeros(1, TRUTH)
+    truth["counter"], truth["force"] = 3, 5_000.0
+    recorder.note_sent(100 * S, truth)
+    compared = []
+    for source in (FUSED, PREDICTED):
+        recorder.count = 0
+        recorder.note_received(_force(1, source=source))
+        compared.append(recorder.compare(0))
+    assert [len(one.force_N) for one in compared] == [1, 0] and compared[0].true_N[0] == 5_000.0
 
 
 def test_the_reference_is_the_true_force_at_the_time_of_the_frames(monkeypatch):

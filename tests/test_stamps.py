@@ -110,7 +110,9 @@ def test_what_was_recorded_before_a_trigger_is_a_log_too(columns, tmp_path):
     assert log.time_ns[0] >= 0 and log.samples["angle"][100] == pytest.approx(columns["angle_rad"][100], abs=1e-3)
 
 
-@pytest.mark.parametrize(("unit", "starts_anew"), [("ms", 2**16), ("us", 2**32), ("s", 86_400), ("s", 3600)])
+@pytest.mark.parametrize(
+    ("unit", "starts_anew"), [("ms", 2**8), ("ms", 1000), ("ms", 2**16), ("us", 2**32), ("s", 86_400), ("s", 3600)]
+)
 def test_a_counter_that_is_full_and_a_clock_at_midnight_go_on(tmp_path, unit, starts_anew):
     """A motor at 2 rad/s, its stamps begun anew in the middle: as far apart as before."""
     per_s = {"ms": 1e3, "us": 1e6, "s": 1.0}[unit]
@@ -198,8 +200,9 @@ def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
         (lambda t: np.where(np.arange(len(t)) == 500, 1e7, t), "time goes back by 1e+07 s after value 501"),
         (lambda t: 0.0 * t, "749 values, all of them of one time"),
         (lambda t: np.concatenate([t[:400], t[: len(t) - 400]]), "time goes back by 1.596 s after value 400"),
+        (lambda t: 0.001 * (np.arange(len(t)) % 256), "time begins anew 2 times and never passes 0.255 s"),
     ],
-    ids=["ms", "us", "s as us", "days of a spreadsheet", "year", "outlier", "no clock", "two recordings"],
+    ids=["ms", "us", "s as us", "days of a spreadsheet", "year", "outlier", "no clock", "two recordings", "counter"],
 )
 def test_times_that_cannot_be_are_refused(columns, tmp_path, time_s, said):
     with pytest.raises(InputError) as caught:
@@ -365,6 +368,18 @@ def test_gaps_are_told_with_their_place_and_length(columns, tmp_path, capsys):
     assert "MotorAngle: a gap of 0.5 s, 0.996 s after the first value" in said
     assert "CurrentQ: 2 gaps, together 0.664 s, the longest of 0.5 s" in said
     assert "ClampForceRef" not in said
+
+
+def test_a_speed_adds_up_to_no_way_where_nothing_was_recorded():
+    """A recorder that pauses: the last and the first speed say nothing of five minutes between them. What is late goes on."""
+    time_s = 0.004 * np.arange(1000)
+    speed = np.full(1000, 2.0)
+    late_ns = (1e9 * (time_s + 0.05 * (time_s >= 2.0))).astype(np.int64)
+    assert Series(late_ns, speed).integral().values[-1] == pytest.approx(2.0 * (time_s[-1] + 0.05))
+    pause_ns = (1e9 * (time_s + 300.0 * (time_s >= 2.0))).astype(np.int64)
+    assert Series(pause_ns, speed).integral().values[-1] == pytest.approx(2.0 * (time_s[-1] - 0.004))
+    said = contradictions("FL", {"EMB_FL_Resolver": {"MotorSpeed": Series(pause_ns, speed)}})
+    assert "MotorSpeed: a gap of 300 s, 1.996 s after the first value; nothing is known of it meanwhile" in said
 
 
 @pytest.mark.parametrize(
@@ -1206,6 +1221,33 @@ def test_what_our_messages_would_round_away_is_said(tmp_path, capsys, factor, sa
     read(tmp_path, columns, foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}"))
     told = capsys.readouterr().err
     assert all(line in told for line in said) and ("covers" in told) == bool(said), told
+
+
+@pytest.mark.parametrize(
+    ("speed_rad_per_s", "current_A", "load_N", "said"),
+    [
+        (50.0, 4.0, 0.0, []),
+        (0.05, 4.0, 0.0, ["MotorSpeed covers 5."]),
+        (50.0, 4e-4, 0.0, ["CurrentQ covers 0.08"]),
+        (None, 4.0, 1e4, []),
+        (None, 4e-3, 1e4, ["CurrentQ covers 0.8"]),
+        (0.0, 4e-3, 0.0, []),
+    ],
+)
+def test_what_rounding_hides_is_said_without_an_angle(speed_rad_per_s, current_A, load_N, said):
+    """A motor whose speed alone is measured, one locked against a torque sensor, and one that stands: it has only noise."""
+    rng, wave = np.random.default_rng(2), np.sin(0.01 * np.arange(4000))
+
+    def column(most: float, noise: float) -> Series:
+        return Series(4_000_000 * np.arange(4000), most * wave + noise * rng.normal(size=4000))
+
+    messages = {"EMB_FL_Current": {"CurrentQ": column(current_A, 0.01 * current_A)}, "RIG_FL_Force": {"ClampForceRef": load_N}}
+    if load_N:
+        messages["RIG_FL_Force"]["ClampForceRef"] = column(load_N, 10.0)
+    if speed_rad_per_s is not None:
+        messages["EMB_FL_Resolver"] = {"MotorSpeed": column(speed_rad_per_s, 0.001)}
+    told = [line for line in contradictions("FL", messages) if "covers" in line]
+    assert len(told) == len(said) and all(one.startswith(start) for one, start in zip(told, said, strict=True)), told
 
 
 def test_a_brake_that_stands_is_no_contradiction(tmp_path, capsys):

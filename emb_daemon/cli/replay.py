@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from emb_daemon.cli.options import (
@@ -76,6 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
             raise InputError(f"{result.path}: no brake torque (BrakeTorqueRef) in it; expected without --measured-torque")
     if arguments.output:
         _write_table(arguments.output, results)
+    if not calibration.contact.is_in_reach:
+        # A load is none of these: of either sign, and of no angle.
+        results = [replace(result, force_N=np.full(len(result.force_N), np.nan)) for result in results]
     if arguments.report:
         _write_report(arguments, results, replay.corners[0], calibration)
     report = [result.figures for result in results]
@@ -99,7 +103,7 @@ def _calibration(arguments: argparse.Namespace):
         clearance = calibration.contact.clearance_rad
         tell(
             f"{arguments.calibration}: contact.clearance_rad is {clearance:g} rad, so there is nothing to clamp; estimates "
-            "are clamp forces, never negative; `diagnose` takes a load of either sign"
+            "are clamp forces, never negative, and no load judges them; `diagnose` takes a load of either sign"
         )
     if arguments.mapping and not arguments.calibration:
         tell(f"no --calibration: estimates are those of another actuator, {calibration.actuator}; identify makes this one's")
@@ -198,7 +202,7 @@ def _print(report: dict) -> None:
     _shares("found", {TABLE[name].sentence: share for name, share in report["facts"].items()})
     forces, temperatures = report["force_N"], report["temperature_K"]
     if not forces and not temperatures:
-        print("  no clamp force and no temperature reference in this log to judge by")
+        print("  no clamp force and no temperature reference to judge by")
     for unit, group in (("N", {k: v for k, v in forces.items() if isinstance(v, dict)}), ("K", temperatures)):
         for name, figures in group.items():
             _line(name, figures, unit)

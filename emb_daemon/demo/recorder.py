@@ -8,7 +8,7 @@ from emb_daemon.logs.columns import Decoder
 from emb_daemon.monitor.listener import Corner, Listener
 from emb_daemon.offline.score import figures, share_inside
 from emb_daemon.plant.records import CYCLE_NS, TRUTH
-from emb_daemon.wire.contract import INVALID, STATUS_DEGRADED
+from emb_daemon.wire.contract import INVALID, PREDICTED, STATUS_DEGRADED
 from emb_daemon.wire.e2e import COUNTER_MODULO, status_of
 from emb_daemon.wire.frames import FRAME
 from emb_daemon.wire.layout import CLAMP_FORCE, CORNERS, PAD_TEMP, default_layout
@@ -111,7 +111,8 @@ class Recorder:
         frames, at, status, response = self._match(row, 0, self.count)
         corner = self.corners[row]
         columns = Decoder().columns(frames, f"EMB_{corner}_ClampForce")
-        answers = columns["InputAge"] == 0.0
+        # A sample that the machine held up on its way has an age, but its estimate is no prediction.
+        answers = (columns["InputAge"] == 0.0) | (columns["ForceSource"] < PREDICTED)
         time = 1e-9 * (self.truth["time_ns"][at, row] - self.truth["time_ns"][0, row])
         return Comparison(
             time_s=time[answers],

@@ -24,9 +24,6 @@ from emb_daemon.logs.series import Series
 _PARTS, _LEAST_IN_PART = 10, 10
 #: Least mean of the current at one end of the travel, as a share of the largest, and as a multiple of that at the other end.
 _HOLDS, _MORE = 0.2, 2.0
-#: Least time without a value that is a gap, s: half a clamp; and in periods of the signal, since recorders of few values
-#: wait for the next.
-_GAP_S, _GAP_PERIODS = 0.1, 10.0
 #: Travel below which a motor stands, rad, and everything that correlates with its angle is noise.
 _TRAVEL_RAD = 1.0
 #: Correlation of angle and acceleration up to which their parts of the current can be separated.
@@ -95,7 +92,8 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     for name, found in own.items():
         if not np.ptp(found.values):
             lines.append(f"{name} is {found.values[0]:g} throughout: leave it out if it was not measured")
-    lines += _find_gaps(own)
+    speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
+    lines += _find_gaps(own if angle is not None or speed is None else {"MotorSpeed": speed} | own)
     lines += find_command(current) if current is not None else []
     lines += _find_not_released(force, messages.get("VEH_Status", {})) if force is not None and not bare else []
     lines += _find_staying(angle, force) if angle is not None and force is not None and not bare else []
@@ -104,8 +102,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
             text = f"MotorAngle jumps by about {jump:.5g} rad and back to and fro; does it start anew? Then state its `period`"
             return [*lines, text + _turn_as(jump)]
         lines += _find_angle_unit(angle)
-        lines += _find_rounded(corner, angle, current, bare)
-    speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
+    lines += _find_rounded(corner, angle, speed, current, force, bare)
     moves = not (speed is None or current is None or is_unresolved(corner, messages))
     load = force
     if is_free:
@@ -153,8 +150,7 @@ def _find_gaps(signals: dict[str, Series]) -> list[str]:
     """A line on how often and how long nothing was recorded, for all signals of which that is the same."""
     names: dict[str, list[str]] = {}
     for name, found in signals.items():
-        steps = 1e-9 * np.diff(found.time_ns)
-        gaps = np.flatnonzero(steps > max(_GAP_S, _GAP_PERIODS * 1e-9 * found.period_ns))
+        steps, gaps = 1e-9 * np.diff(found.time_ns), found.gaps
         if len(gaps):
             longest = gaps[np.argmax(steps[gaps])]
             at = 1e-9 * (found.time_ns[longest] - found.time_ns[0])
@@ -318,27 +314,31 @@ def _find_angle_unit(angle: Series) -> list[str]:
     return [f"MotorAngle changes by {fastest:.4g} rad/s ({fastest * 30.0 / np.pi:.3g} rpm), which no motor does: {what}"]
 
 
-def _find_rounded(corner: str, angle: Series, current: Series | None, bare: bool) -> list[str]:
-    """A line on a motion, or the current for it, that is too small for the steps of our messages; ``bare`` of what clamps
-    nothing, whose motor does not stand for long."""
+def _find_rounded(
+    corner: str, angle: Series | None, speed: Series | None, current: Series | None, force: Series | None, bare: bool
+) -> list[str]:
+    """A line on a motion, or the current for it, that is too small for the steps of our messages; ``speed`` measured, or the
+    change of the angle; ``bare`` of what clamps nothing, whose motor does not stand for long but against a load."""
 
-    def covered(message: str, signal: str, values: np.ndarray) -> float:
+    def covered(message: str, signal: str, found: Series) -> float:
         step = shipped_database("dbc/emb.dbc").get_message_by_name(message.format(corner)).get_signal_by_name(signal).scale
-        return float(np.ptp(np.quantile(values, (0.01, 0.99))) / step)
+        return float(np.ptp(np.quantile(found.values, (0.01, 0.99))) / step)
 
-    way = covered("EMB_{}_Resolver", "MotorAngle", angle.values)
+    def goes(found: Series | None) -> bool:
+        # What stands has noise.
+        return found is not None and np.std(np.diff(found.values)) < _SMOOTH * np.std(found.values)
+
     lines, lost = [], "steps of our message, and rounding hides what it says"
     how = "of what turns behind a gear state the motor's, angle and speed alike by the gear's ratio as `scale`"
-    if way < _TURNS:
-        # A joint that is locked has noise.
-        goes = way > 0.0 and np.std(np.diff(angle.values)) < _SMOOTH * np.std(angle.values)
-        how = f"{how}, of a deflection any that makes radians of it"
-        return [f"MotorAngle covers {way:.2g} {lost}: {how}"] if bare and goes else []
-    speed = covered("EMB_{}_Resolver", "MotorSpeed", angle.derivative().values)
+    way = covered("EMB_{}_Resolver", "MotorAngle", angle) if angle is not None else _TURNS * goes(speed)
     # The speed of samples that are too rare for it is not known.
-    if speed < _LEAST_COVERED and not (angle.course_is_unknown if bare else angle.way_is_unknown):
-        lines.append(f"MotorSpeed covers {speed:.2g} {lost}: {how}")
-    if current is not None and 0.0 < (steps := covered("EMB_{}_Current", "CurrentQ", current.values)) < _LEAST_COVERED:
+    known = angle is None or not (angle.course_is_unknown if bare else angle.way_is_unknown)
+    if way < _TURNS and bare and goes(angle):
+        lines.append(f"MotorAngle covers {way:.2g} {lost}: {how}, of a deflection any that makes radians of it")
+    elif way >= _TURNS and known and (steps := covered("EMB_{}_Resolver", "MotorSpeed", speed)) < _LEAST_COVERED:
+        lines.append(f"MotorSpeed covers {steps:.2g} {lost}: {how}")
+    loaded = way >= _TURNS or (bare and goes(force))
+    if loaded and current is not None and 0.0 < (steps := covered("EMB_{}_Current", "CurrentQ", current)) < _LEAST_COVERED:
         lines.append(f"CurrentQ covers {steps:.2g} {lost}: `scale` it up, and the torque constant down")
     return lines
 

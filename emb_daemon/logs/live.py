@@ -20,7 +20,7 @@ from emb_daemon.logs.foreign_frames import alone
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.mapping_file import Source
 from emb_daemon.logs.resample import HEADER, cycle_ns, fill_missing, our_messages, unrepeated
-from emb_daemon.logs.series import CARRIED_CYCLES
+from emb_daemon.logs.series import CARRIED_CYCLES, longest_step_ns
 from emb_daemon.runtime.bus import PythonCan, PythonCanBus, open_python_can
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.e2e import COUNTER_MODULO, protect
@@ -73,6 +73,7 @@ class _Message:
     signals: dict[str, _Value | float]
     layout: dict[str, np.void]
     sent_ns: int = 0
+    period_ns: float = math.inf
     counter: int = -1
     before: dict[str, float] = field(default_factory=dict)
 
@@ -255,13 +256,16 @@ class MappedBus(PythonCanBus):
 
 
 def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
-    """Angle and speed at a sample; if the rig measures one of them, the other from its change since the sample before."""
+    """Angle and speed at a sample; if the rig measures one of them, the other from its change since the sample before. A
+    speed adds no way while the bus was silent (`Series.integral`)."""
     known = resolver.last()
-    elapsed_s = 1e-9 * (time_ns - resolver.sent_ns) if resolver.sent_ns else math.inf
+    elapsed_ns = time_ns - resolver.sent_ns if resolver.sent_ns else math.inf
+    elapsed_s = 1e-9 * elapsed_ns
     before = resolver.before
+    resolver.period_ns = min(resolver.period_ns, elapsed_ns)
     if "MotorAngle" not in known:
         known["MotorAngle"] = before.get("MotorAngle", 0.0)
-        if before:
+        if before and elapsed_ns <= longest_step_ns(resolver.period_ns):
             known["MotorAngle"] += 0.5 * (known["MotorSpeed"] + before["MotorSpeed"]) * elapsed_s
     if "MotorSpeed" not in known:
         known["MotorSpeed"] = (known["MotorAngle"] - before["MotorAngle"]) / elapsed_s if before else 0.0

@@ -41,6 +41,8 @@ _STANDING_NS = 1_000_000_000
 _IN_TURN = 0.9
 #: Number of periods from which a step of time is a pause.
 _PAUSE = 10
+#: Samples after which what was sent late for want of a processor no longer counts: some tenths of a second.
+_MADE_UP = 64
 #: A step of the angle that differs from the integrated speed by more than this angle (rad), plus the change of speed times the
 #: time (s) between the sampling of both, looks to the estimator like a resolver that lost its zero. That happens once and not
 #: repeatedly: largest share of such steps, and that of a machine whose force does not rest on its angle, and whose speed is
@@ -248,7 +250,13 @@ def _has_another_rate(resolver: np.ndarray) -> bool:
     # The mean without pauses, in which a busy machine's delays cancel, unlike in the median.
     middle = np.median(steps)
     cycles = np.mean(steps[steps <= max(_PAUSE * middle, _PAUSE * CYCLE_NS)]) / CYCLE_NS
-    return abs(cycles - 1.0) > SAME_PERIOD and middle < (1.0 - SAME_PERIOD) * SPARSE_CYCLES * CYCLE_NS
+    # A delay that is as long as a pause is made up for by what was held up and follows at once.
+    sent = np.concatenate([[0], np.cumsum(np.diff(counters) % COUNTER_MODULO)])
+    ago = min(_MADE_UP, len(resolver) - 1)
+    times = resolver["time_ns"]
+    made_up = np.median((times[ago:] - times[:-ago]) / np.maximum(sent[ago:] - sent[:-ago], 1)) / CYCLE_NS
+    other = min(abs(cycles - 1.0), abs(made_up - 1.0)) > SAME_PERIOD
+    return bool(other) and middle < (1.0 - SAME_PERIOD) * SPARSE_CYCLES * CYCLE_NS
 
 
 def is_received(message: str) -> bool:

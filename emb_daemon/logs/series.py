@@ -24,11 +24,19 @@ _UNKNOWN_SHARE = 0.1
 LEAST_SAMPLES = 50
 #: Longest gap, in nominal cycles of our message or in periods of theirs, over which a value is held.
 CARRIED_CYCLES, CARRIED_PERIODS = 5, 3
+#: Least time without a value that is a gap, ns: half a clamp; and in periods of the signal, since recorders of few values
+#: wait for the next.
+_GAP_NS, _GAP_PERIODS = 100_000_000, 10.0
 #: Correlation of a speed with its next sample from which the mean of the two is the speed between them: of a sine it is the
 #: cosine of the phase that passes, and at 0.95 (20 samples a period) the mean is 3 % small.
 RESOLVED = 0.95
 #: Relative variation of a constant value by rounding.
 _STEADY = 1e-6
+
+
+def longest_step_ns(period_ns: float) -> float:
+    """Between two values of a signal of that period; where there is more nothing was measured for long."""
+    return max(_GAP_NS, _GAP_PERIODS * period_ns)
 
 
 @dataclass(frozen=True)
@@ -178,9 +186,15 @@ class Series:
         change = self._between(after) - self._between(before)
         return Series(self.time_ns, change / np.maximum(1e-9 * (after - before), 1e-9))
 
+    @property
+    def gaps(self) -> np.ndarray:
+        """Rows after which nothing was measured for long."""
+        return np.flatnonzero(np.diff(self.time_ns) > longest_step_ns(self.period_ns))
+
     def integral(self) -> "Series":
-        """Area under the signal since its first value."""
+        """Area under the signal since its first value. A gap adds none, unknown as it is: recorders pause at rest."""
         steps = 0.5 * (self.values[1:] + self.values[:-1]) * (1e-9 * np.diff(self.time_ns))
+        steps[self.gaps] = 0.0
         return Series(self.time_ns, np.concatenate([np.zeros(min(len(self.values), 1)), np.cumsum(steps)]))
 
     def _between(self, at_ns: np.ndarray) -> np.ndarray:

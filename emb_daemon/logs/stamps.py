@@ -13,6 +13,9 @@ _BACK_NS = 1_000_000_000
 #: Least share of the values between two steps back that makes them the recording; other values were stamped before a clock was
 #: set.
 _ONE_RECORDING = 0.99
+#: Share of a recording's whole time by which a counter goes back each time it overflows, and frames out of order, jitter and a
+#: clock that is set do not, or once.
+_ANEW = 0.5
 #: Largest share of its range that a column of times between rows goes on by from its first to its last quarter, where a clock
 #: does by three quarters; and least share of its steps that go back, where in noise a half do and in a clock almost none.
 _NO_CLOCK = 0.25
@@ -68,7 +71,7 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
         columns: of values, shape (n,) each, by which repetitions are recognised.
 
     Raises:
-        InputError: time goes back by more than a second, or does not pass.
+        InputError: time goes back by more than a second, begins anew again and again, or does not pass.
     """
     rows = np.arange(len(time_ns))
     if len(back := np.flatnonzero(np.diff(time_ns) < -_BACK_NS)):
@@ -81,6 +84,12 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
         tell(
             f"{source}: time goes back by {by:.6g} s after value {back[0] + 1}: {len(time_ns) - len(rows)} of {len(time_ns)} "
             "values of another time left out"
+        )
+    whole = np.ptp(time_ns[rows]) if len(rows) else 0
+    if (anew := int(np.sum(np.diff(time_ns[rows]) < -_ANEW * whole))) > 1:
+        raise InputError(
+            f"{source}: time begins anew {anew} times and never passes {1e-9 * float(whole):.3g} s, as a counter does that "
+            "overflows; expected a clock; of rows that are evenly apart state `rate_Hz` without a column of times"
         )
     rows = rows[np.argsort(time_ns[rows], kind="stable")]
     times = time_ns[rows]

@@ -37,9 +37,9 @@ _GROUPED, _SPACES = re.compile(r"[+-]?\d[\d.,'’\s]*(?:[eE][+-]?\d+)?"), re.com
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
 #: Months as tools abbreviate them, and number of digits of a year at the beginning of a date.
 _MONTHS, _YEAR = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"], 4
-#: After how much a clock without hours or a date starts anew, s, and a logger's counter of 16 or 32 bits or the part of a
-#: second that stands in a column of its own (µs, ns), in its unit; how many ordinary steps may pass meanwhile.
-_CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**16, 10**6, 10**9, 2**32), 10.0
+#: After how much a clock without hours or a date starts anew, s, and a counter of 8, 16 or 32 bits or the part of a
+#: second that stands in a column of its own (ms, µs, ns), in its unit; how many ordinary steps may pass meanwhile.
+_CLOCKS_S, _COUNTERS, _ORDINARY_STEPS = (3600, 86_400), (2**8, 1000, 2**16, 10**6, 10**9, 2**32), 10.0
 #: What the part of a unit of time in a column of its own counts to; share of that which it reaches, and of its steps that rise
 #: within one unit and fall at a new one: what is sampled twice a second or more often does.
 _PARTS, _REACHED, _IN_ORDER = (1e3, 1e6, 1e9), 0.4, 0.9

@@ -222,7 +222,7 @@ def replay_page(
         headline = f"Clamp force: RMSE {of['rmse']:.0f} N, 95 % within {of['p95']:.0f} N, largest {of['max']:.0f} N"
         details.insert(0, f"{inside:.1f} % of the errors are inside two sigma; a normal distribution has 95.4 %.")
     else:
-        headline = f"Clamp force up to {1e-3 * np.nanmax(estimates['force']):.1f} kN; the log has no reference force"
+        headline = f"Clamp force up to {1e-3 * np.nanmax(estimates['force']):.1f} kN; no reference force to judge by"
     page.verdict(None, headline, details)
     panels = _panels(time_s, estimates, force_N)
     events, labels = _events(time_s, estimates)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, CLAMP_FORCE, PROJECT, RESOLVER, Recording, answers, playing, replayed, wait_for
+from bus_tools import CHANNEL, CLAMP_FORCE, PROJECT, RESOLVER, Recording, answers, differ, playing, replayed, wait_for
 
 pytestmark = pytest.mark.target("can")
 
@@ -46,8 +46,8 @@ def test_no_sample_is_lost_in_road_traffic(
     daemon: subprocess.Popen[bytes], record: Callable[..., Recording], rig_log: Path, traffic: Path, tmp_path: Path
 ) -> None:
     """With a road car's frames at full rate beside the samples, the daemon answers what was on the bus as replay does, which
-    has all the time it wants: sample for sample, bit for bit. What the machine held up on its way to the bus, both hear late.
-    """
+    has all the time it wants: sample for sample, bit for bit, but for the sigma of the few whose stamps it did not believe.
+    What the machine held up on its way to the bus, both hear late."""
     with record(f",{CLAMP_FORCE:X}:7FF") as waiting:
         wait_for("the daemon speaks", lambda: waiting.path.read_text().strip(), timeout_s=300)
     with record(f",{CLAMP_FORCE:X}:7FF,100:700") as recording, playing(traffic), playing(rig_log) as player:
@@ -60,4 +60,7 @@ def test_no_sample_is_lost_in_road_traffic(
     samples = sum(frame.can_id == RESOLVER for frame in recording.frames)
     print(f"{samples} samples, {len(live)} answered live, {len(alone)} by replay")
     assert len(live) > 2000
-    assert live == alone[: len(live)] and len(alone) - len(live) <= 2
+    assert 0 <= len(alone) - len(live) <= 2
+    odd = differ(live, alone[: len(live)])
+    print(f"{len(odd)} with another sigma or age")
+    assert len(odd) <= len(live) / 100
