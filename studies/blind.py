@@ -35,6 +35,7 @@ from emb_daemon.effects import REGISTRY
 from emb_daemon.offline.log import log_of
 from emb_daemon.offline.score import rmse
 from emb_daemon.plant.brake import ONSET, POWER, SATURATION, SIGNALS, drawn_amount
+from emb_daemon.plant.car import COUNTER_RAD
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.records import PLANT, PLANT_STATE
 from emb_daemon.plant.scenarios import Schedule, random_angle, rest, simulate_log
@@ -300,7 +301,8 @@ def sized(base: np.void, schedule: Schedule, start: Calibration, hidden: dict, s
     def simulated(tried: float) -> tuple[float, np.ndarray]:
         plant = base.copy()
         _put(plant, {name: values | {"size": tried}})
-        frames, truth = simulate_log(plant, schedule, seed=seed)
+        # With the wheel's counter anywhere in its range, as when seeds were first drawn.
+        frames, truth = simulate_log(plant, schedule, seed=seed, wheels_rad=COUNTER_RAD)
         return rmse(_sizing_bench(frames, start).residuals({})[channel]), truth[:, 0]
 
     floor, _ = simulated(0.0)
@@ -369,7 +371,8 @@ def _draw_hidden(
         return {names[0]: dict(_FOREIGN[names[0]])}
     hidden: dict[str, dict[str, float]] = {}
     if names:
-        frames, _ = simulate_log(base, schedule, seed=seed)
+        # With the wheel's counter anywhere in its range, as when seeds were first drawn.
+        frames, _ = simulate_log(base, schedule, seed=seed, wheels_rad=COUNTER_RAD)
         bench = _sizing_bench(frames, start)
         for name in names:
             values = draw(name, rng)

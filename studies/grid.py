@@ -29,7 +29,7 @@ from emb_daemon.plant.car import Car
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.wire.contract import CYCLE_S
 from studies import faults, senders, unlisted
-from studies.drives import park_on_latch
+from studies.drives import draw_braking, draw_interlude, park_on_latch
 from studies.faults import LEARNED, NOMINAL, Fault, Size, size_of
 from studies.phases import LEARNED_RMSE_N, LEARNED_USEFUL, NOMINAL_USEFUL, POWER_ON_S, judge, verdict
 from studies.strangers import draw_stranger
@@ -61,16 +61,26 @@ def _reversals(seconds: float, low_N: float, high_N: float) -> sc.Schedule:
 
 
 def draw_drive(
-    plant: np.void, rng: np.random.Generator, latched_N: float = 0.0, share: float = 1.0
+    plant: np.void, rng: np.random.Generator, latched_N: float = 0.0, share: float = 1.0, drawn: bool = False
 ) -> tuple[sc.Schedule, dict[str, float]]:
     """A drive of two minutes or so and when its parts begin, s: stops, holds, reversals, long drags, park brake with
-    time for a training stroke, driving again, random angle. ``share``: of the forces of a brake of 30 kN."""
+    time for a training stroke, driving again, random angle. ``share``: of the forces of a brake of 30 kN. ``drawn``: how the
+    brakes are used is drawn, too, and what comes between."""
 
     def between(low, high):
         return float(rng.uniform(low, high))
 
     def force(low, high):
         return share * between(low, high)
+
+    def stop(force_N, seconds):
+        return draw_braking(rng, force_N, seconds * between(0.5, 2.0)) if drawn else sc.stop(force_N, seconds)
+
+    def drag(force_N, speed, seconds):
+        return draw_braking(rng, force_N, seconds * between(0.5, 3.0), speed) if drawn else sc.drag(force_N, speed, seconds)
+
+    def interlude(name):
+        return ((name, draw_interlude(rng, share)),) if drawn else ()
 
     # Half of the drives begin on a car that stood parked overnight: training on cold pads comes first.
     cold = (("park_0", sc.park(force(1e4, 1.5e4), _PARK_S)),) if rng.random() < 0.5 else ()
@@ -79,28 +89,32 @@ def draw_drive(
         *cold,
         ("hold_1", sc.stop(force(6e3, 11e3), 3.0)),
         ("go_1", sc.accelerate(between(12.0, 16.0), 4.0)),
-        ("stop_1", sc.stop(force(4e3, 8e3), 4.0)),
+        ("stop_1", stop(force(4e3, 8e3), 4.0)),
+        *interlude("between_1"),
         ("go_2", sc.accelerate(between(16.0, 20.0), 5.0)),
-        ("drag_1", sc.drag(force(2e3, 4e3), 18.0, 8.0)),
-        ("stop_2", sc.stop(force(8e3, 14e3), 3.5)),
+        ("drag_1", drag(force(2e3, 4e3), 18.0, 8.0)),
+        ("stop_2", stop(force(8e3, 14e3), 3.5)),
         ("reversals", _reversals(4.0, share * 5e3, share * 8e3)),
+        *interlude("between_2"),
         ("go_3", sc.accelerate(between(20.0, 25.0), 6.0)),
-        ("stop_3", sc.stop(force(14e3, 22e3), 3.5)),
+        ("stop_3", stop(force(14e3, 22e3), 3.5)),
         ("stand_2", sc.rest(1.5)),
         ("go_4", sc.accelerate(10.0, 3.0)),
-        ("stop_4", sc.stop(force(2e3, 5e3), 4.0)),
+        ("stop_4", stop(force(2e3, 5e3), 4.0)),
+        *interlude("between_3"),
         ("go_5", sc.accelerate(between(10.0, 18.0), 4.5)),
-        ("stop_5", sc.stop(force(5e3, 12e3), 4.0)),
+        ("stop_5", stop(force(5e3, 12e3), 4.0)),
         ("stand_3", sc.rest(1.0)),
         ("park", sc.park(force(1e4, 1.5e4), _PARK_S)),
         ("go_6", sc.accelerate(14.0, 4.0)),
-        ("stop_6", sc.stop(force(5e3, 9e3), 4.0)),
+        ("stop_6", stop(force(5e3, 9e3), 4.0)),
+        *interlude("between_4"),
         ("go_7", sc.accelerate(18.0, 4.5)),
-        ("drag_2", sc.drag(force(2e3, 4e3), 16.0, 6.0)),
-        ("stop_7", sc.stop(force(1e4, 2e4), 3.5)),
-        ("hold_2", sc.stop(force(6e3, 11e3), 3.0)),
+        ("drag_2", drag(force(2e3, 4e3), 16.0, 6.0)),
+        ("stop_7", stop(force(1e4, 2e4), 3.5)),
+        ("hold_2", stop(force(6e3, 11e3), 3.0)),
         ("go_8", sc.accelerate(between(10.0, 18.0), 4.5)),
-        ("stop_8", sc.stop(force(3e3, 8e3), 4.0)),
+        ("stop_8", stop(force(3e3, 8e3), 4.0)),
         ("random", sc.random_angle(plant, 4.0, rng, high_N=share * 12e3)),
         ("end", sc.rest(1.0)),
     )
@@ -201,7 +215,7 @@ def _with_effects(calibration: Calibration, effects: dict) -> Calibration:
     return msgspec.convert(changed, Calibration)
 
 
-def prepare(names: tuple[str, ...], number: int, seed: int, brake: Brake, families: dict = FAMILIES):
+def prepare(names: tuple[str, ...], number: int, seed: int, brake: Brake, families: dict = FAMILIES, drawn: bool = False):
     """Drive number ``number`` of a brake with faults of these ``families``: (fault, moments, the daemon's calibration with the
     effects that brake and calibration share, car, schedule)."""
     rng = np.random.default_rng([seed, number, *(zlib.crc32(name.encode()) for name in names)])
@@ -210,7 +224,7 @@ def prepare(names: tuple[str, ...], number: int, seed: int, brake: Brake, famili
     drive_seed = int(rng.integers(1 << 32))
     plain = plant_from_calibration(own)
     latched_N = size.force * 1e4 if "start_latched" in names else 0.0
-    moments = draw_drive(plain, np.random.default_rng(drive_seed), latched_N, size.force)[1]
+    moments = draw_drive(plain, np.random.default_rng(drive_seed), latched_N, size.force, drawn)[1]
     fault = _join([families[name](rng, moments, size) for name in names])
     if fault.effects:
         calibration, own = _with_effects(calibration, fault.effects), _with_effects(own, fault.effects)
@@ -220,7 +234,7 @@ def prepare(names: tuple[str, ...], number: int, seed: int, brake: Brake, famili
     for name in ("current_noise", "speed_noise", "angle_noise", "temperature_noise"):
         plant[name] *= rng.uniform(0.8, 1.2)
     fault.brake(plant)
-    schedule, moments = draw_drive(plant, np.random.default_rng(drive_seed), fault.latched_N, size.force)
+    schedule, moments = draw_drive(plant, np.random.default_rng(drive_seed), fault.latched_N, size.force, drawn)
     schedule.drives["ambient"] = fault.ambient_C
     car = Car(np.atleast_1d(plant), seed=int(rng.integers(1 << 32)), ambient=fault.ambient_C)
     for name in ("mass", "drag", "rolling"):
@@ -237,10 +251,10 @@ def prepare(names: tuple[str, ...], number: int, seed: int, brake: Brake, famili
 
 
 def drive(
-    names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None
+    names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None, drawn: bool = False
 ) -> tuple[Fault, dict, np.ndarray, np.ndarray]:
     """Such a drive of `brake_of` ``stranger``: (fault, moments, ESTIMATE rows, true force at each, N)."""
-    fault, moments, calibration, car, schedule = prepare(names, number, seed, brake_of(stranger))
+    fault, moments, calibration, car, schedule = prepare(names, number, seed, brake_of(stranger), drawn=drawn)
     commands = sc.commands_of(schedule, ("FL",))
     silences = [(0.0, fault.power_on_s)] + [(at, at + off) for at, off in fault.restarts]
     restarts = sorted(at + off for at, off in fault.restarts)
@@ -267,9 +281,9 @@ def drive(
     return fault, moments, estimates, force_N[row]
 
 
-def judge_drive(names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None) -> dict:
+def judge_drive(names: tuple[str, ...], number: int, seed: int, stranger: Path | None = None, drawn: bool = False) -> dict:
     """Verdict of one drive."""
-    fault, moments, estimates, force_N = drive(names, number, seed, stranger)
+    fault, moments, estimates, force_N = drive(names, number, seed, stranger, drawn)
     time_s = 1e-9 * estimates["time_ns"]
     onset = max(fault.onset_s, *(at + off + POWER_ON_S for at, off in ((0.0, fault.power_on_s), *fault.restarts)))
     park, after = moments["park"], moments["after"]
@@ -307,11 +321,11 @@ def pairs_of(count: int, seed: int, names: list[str]) -> list[tuple[str, str]]:
     return pairs
 
 
-def run_grid(tasks: list[tuple[tuple[str, ...], int]], seed: int, stranger: Path | None, processes: int):
+def run_grid(tasks: list[tuple[tuple[str, ...], int]], seed: int, stranger: Path | None, processes: int, drawn: bool = False):
     """Verdicts of (families, number) in turn, as they come."""
     if processes == 1:
-        yield from (judge_drive(names, number, seed, stranger) for names, number in tasks)
+        yield from (judge_drive(names, number, seed, stranger, drawn) for names, number in tasks)
         return
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        rest = [seed] * len(tasks), [stranger] * len(tasks)
+        rest = [seed] * len(tasks), [stranger] * len(tasks), [drawn] * len(tasks)
         yield from pool.map(judge_drive, *zip(*tasks, strict=True), *rest, chunksize=4)

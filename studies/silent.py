@@ -227,7 +227,9 @@ def grid(arguments: argparse.Namespace) -> int:
         pairs = arguments.pairs if arguments.pairs is not None else 0 if arguments.faults else 100
         tasks += [(pair, number) for number, pair in enumerate(pairs_of(pairs, arguments.seed, chosen))]
     begun = time.monotonic()
-    table, reports = _collect(run_grid(tasks, arguments.seed, arguments.stranger, arguments.processes), arguments)
+    table, reports = _collect(
+        run_grid(tasks, arguments.seed, arguments.stranger, arguments.processes, arguments.drawn), arguments
+    )
     if arguments.table:
         drawn = {"count": arguments.count, "pairs": arguments.pairs, "seed": arguments.seed}
         options = " ".join(f"--{name} {value}" for name, value in drawn.items() if value is not None)
@@ -304,6 +306,7 @@ def main(argv: list[str] | None = None) -> int:
     drives.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default 0)")
     drives.add_argument("--pairs", type=int, metavar="N", help="drives with two faults (default 100, none with --faults)")
     drives.add_argument("--stranger", type=Path, metavar="DIR/SEED", help="a brake of `studies.strangers`, not our own")
+    drives.add_argument("--drawn", action="store_true", help="how and when is braked is drawn, too")
     drives.add_argument("--processes", type=int, default=2, metavar="N")
     drives.add_argument("--table", type=Path, metavar="FILE.md", help="write the table of detection times into this page")
     drives.set_defaults(run=grid)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from emb_daemon.plant.car import COUNT_RAD
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import random_angle, simulate_log
 from studies.drives import rig_drag, rig_stop, training
@@ -17,13 +18,13 @@ def drive(plant, rng, stops):
     return schedule + rig_drag(rng.uniform(2500.0, 5000.0), rng.uniform(20.0, 40.0), 10.0)
 
 
-def drives(calibration, seed, effects, reference=True, stops=5, drive=drive):
+def drives(calibration, seed, effects, reference=True, stops=5, drive=drive, wheels_rad=COUNT_RAD):
     """Two drives of one brake, each simulated when it is asked for."""
     plant = plant_from_calibration(calibration, seed=seed, effects=effects)
     rng = np.random.default_rng(seed)
     schedules = [drive(plant, rng, stops) for _ in range(2)]
     for k, schedule in enumerate(schedules, start=1):
-        yield simulate_log(plant, schedule, seed=seed + k, reference=reference)[0]
+        yield simulate_log(plant, schedule, seed=seed + k, reference=reference, wheels_rad=wheels_rad)[0]
 
 
 def with_late(log, samples, *names):

@@ -1182,6 +1182,18 @@ def test_the_delays_of_a_busy_machine_are_no_other_rate(rig):
     assert at_our_rate(frames) is frames
 
 
+def test_stalls_of_a_busy_machine_are_no_other_rate(rig):
+    """It stands for up to seventy milliseconds, now and then, and then sends at once all that was due meanwhile."""
+    frames = read_frames(rig / "static" / "training_5mm.log.gz")
+    begins = np.cumsum(np.random.default_rng(4).uniform(0.1, 0.3, 1000)) * 1e9 + frames["time_ns"][0]
+    ends = begins + np.random.default_rng(5).uniform(0.03, 0.07, 1000) * 1e9
+    stall = np.searchsorted(begins, frames["time_ns"], side="right") - 1
+    held_up = (stall >= 0) & (frames["time_ns"] < ends[np.maximum(stall, 0)])
+    frames["time_ns"][held_up] = ends[stall[held_up]].astype(int)
+    frames["time_ns"] = np.maximum.accumulate(frames["time_ns"])
+    assert at_our_rate(frames) is frames
+
+
 def test_a_bench_without_a_motor_is_a_log_of_what_it_measured(tmp_path, capsys, recwarn):
     """A heated rod, one value every two seconds: temperatures arrive, and nothing is said of a motor."""
     foreignkit.write_rig(tmp_path)

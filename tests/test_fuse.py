@@ -11,6 +11,7 @@ from emb_daemon.estimator.hypotheses import TORQUE_JUMP
 from emb_daemon.estimator.paths import FLICKER_RAD, stiffness_path, torque_path
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.step import _gained_since, predict, step
+from emb_daemon.estimator.unknown import torque_offset
 from emb_daemon.models.fusion import OF_THE_MODEL
 from emb_daemon.models.lateness import remember
 from emb_daemon.models.plausibility import STIFFNESS_WRONG
@@ -115,6 +116,37 @@ def test_a_torque_beside_a_known_motion_is_as_unsure_as_what_it_is_made_of(p, s,
         s["covariance"][state, state] = 1e-4 / share**2
         sigma = fuse._torque_beside_motion(s, p, m, 0.0)[1]
         assert np.sqrt(sigma**2 - alone**2) == pytest.approx(0.01 / gain)
+
+
+@pytest.mark.parametrize("found", [False, True], ids=["believed", "implausible"])
+def test_what_was_learned_beside_an_implausible_resolver_may_all_be_wrong(p, s, m, found):
+    """Of an offset that no current sensor has, no more is taken out than one may have; sigma covers what motor and friction
+    have learned. With a resolver that is believed they are what they were learned to be."""
+    gain, healthy = float(p["gear_gain"]), 2.0 * float(torque_offset(p))
+    force = 0.1 * float(p["maximum_force"])
+    s["motor_torque"], s["spring_force"], s["covariance"] = force * gain, 0.0, 0.0
+    s["gear_slope"] = s["gear_gain"] = 1.0
+    if found:
+        s["plausibility"]["verdict"] = STIFFNESS_WRONG
+
+    def told(**learned):
+        s["error"] = 0.0
+        for name, value in learned.items():
+            s["error"][getattr(fuse, name)] = value
+        s["plausibility"]["averaged"], s["plausibility"]["torque_variance"] = False, 0.0
+        return fuse._torque_alone(s, p, m)[:2]
+
+    plain, sigma = told()
+    assert plain == pytest.approx(force)
+    off, off_sigma = told(OFFSET=-10.0 * healthy)
+    _, slippery_sigma = told(COULOMB=-0.9 * p["offset_friction"], LOAD=-0.9 * p["load_friction"])
+    if found:
+        assert off == pytest.approx(plain + healthy / gain)
+        assert off_sigma > 10.0 * healthy / gain
+        assert slippery_sigma > 0.9 * sigma
+    else:
+        assert off == pytest.approx(plain + 10.0 * healthy / gain)
+        assert slippery_sigma < 0.2 * sigma
 
 
 def test_pads_that_stand_keep_the_force_that_their_way_there_has_left_them(parameters, s, m):

@@ -516,8 +516,14 @@ def test_replay_of_a_machine_without_pads_says_what_a_clamp_force_is_not(tmp_pat
     foreignkit.write_rig(tmp_path, foreignkit.COLUMNS)
     table = foreignkit.write_table(tmp_path / "a.parquet", stops)
     mapping, calibration = str(tmp_path / "mapping.yaml"), str(tmp_path / "c.yaml")
-    assert main(["replay", str(table), "--mapping", mapping, "--calibration", calibration]) == 0
-    assert f"{calibration}: contact.clearance_rad is 10000 rad, so there is nothing to clamp" in capsys.readouterr().err
+    assert (
+        main(["replay", str(table), "--mapping", mapping, "--calibration", calibration, "--report", str(tmp_path / "r.html")])
+        == 0
+    )
+    printed = capsys.readouterr()
+    assert f"{calibration}: contact.clearance_rad is 10000 rad, so there is nothing to clamp" in printed.err
+    # The load is beside a motor angle that means nothing: an RMSE of the paths would be of no clamp.
+    assert "RMSE" not in printed.out and "no reference force to judge by" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("turns_on", [True, False])

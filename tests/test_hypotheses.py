@@ -37,6 +37,7 @@ from emb_daemon.estimator.hypotheses import (
     to_force,
     to_torque,
     unproven,
+    watch_steps,
     weigh,
 )
 from emb_daemon.estimator.records import new_state
@@ -77,8 +78,7 @@ def p(parameters):
 
 def _drive(p, change=None, stops=12, seed=1, current=None, angle_m=0.0):
     """Samples and true force of stops on a brake that becomes ``change(p)`` after `_BEFORE` of them; ``angle_m``: metres by
-    which
-    its contact angle then moves; ``current`` changes the later rows' current."""
+    which its contact angle then moves; ``current`` changes the later rows' current."""
     path = brake.stops(p, stops, seed)
     rows, force = brake.samples(p, path)
     if change is not None or angle_m:
@@ -224,6 +224,68 @@ def test_a_current_sensor_that_has_drifted_by_twice_a_healthy_ones_offset_is_tol
     told = estimate(rows, p)["reasons"] & PATHS_DISAGREE > 0
     healthy = np.abs(drifted) * p["torque_constant"] / torque_offset(p)
     assert np.all(told[healthy > 2.1]) and np.mean(told[healthy < 1.9]) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("at", [0.3, 0.6])
+@pytest.mark.parametrize("ampere", [-1.5, 1.5, 3.0])
+def test_a_current_that_steps_in_a_slow_stroke_is_no_other_pad(p, ampere, at, seed):
+    """Pads that have told little of their stiffness so far could explain it: kilonewtons, without a word."""
+    slow = np.concatenate((np.linspace(-p["clearance"], 0.0, 100), np.linspace(0.0, 12.0, 750), np.full(250, 12.0)))
+    stops = brake.stops(p, 2, seed)
+    rows, force = brake.samples(p, np.concatenate((stops, p["clearance"] + slow)))
+    begin = len(stops) + 100 + round(750 * at)
+    rows["current_q"][begin:] += ampere
+    estimates = estimate(brake.noisy(rows, p, seed), p)
+    error, sigma = np.abs(estimates["force"] - force)[begin:], estimates["sigma"][begin:]
+    assert np.mean(error > 3.0 * np.hypot(sigma, 25.0)) < 0.01
+    # Whatever is the likeliest: the motor may press against something that has given way.
+    told = estimates["reasons"][begin:] & PATHS_DISAGREE != 0
+    assert np.any(told[:25]) and np.mean(told[25:]) > 0.95
+    assert not np.any((error > 1000.0) & (estimates["reasons"][begin:] == 0))
+
+
+@pytest.mark.parametrize(
+    ("changed", "speed", "gap_s", "opens"),
+    [
+        ({}, 4.0, 0.0, True),
+        ({}, -4.0, 0.0, False),  # friction turns over
+        ({}, 0.2, 0.0, False),
+        ({}, 4.0, 0.02, False),
+        ({"braked_s": 0.1}, 4.0, 0.0, False),  # a contact that has moved
+        ({"before": 2.0}, 4.0, 0.0, False),  # it did not fit before either
+        ({"since_s": 0.01}, 4.0, 0.0, False),
+        ({"odds": -4.0}, 4.0, 0.0, False),  # something has been seen already
+    ],
+)
+def test_a_torque_steps_where_a_sliding_motor_was_explained_until_then(p, changed, speed, gap_s, opens):
+    states = new_state()
+    set_priors(states["covariance"][0], p)
+    open_all(states[0], p)
+    state, known = states[0], {"braked_s": 1.0, "since_s": 1.0, "odds": PRIOR_ODDS} | changed
+    state["contact"]["engaged"], state["friction_mean"], state["scale"] = True, 1.0, 1.0
+    state["alternatives"][TORQUE_JUMP]["prior"] = PRIOR_ODDS
+    state["alternatives"][TORQUE_JUMP]["log_odds"] = known["odds"]
+    for name, value in known.items():
+        state["stepping"][name] = value
+    for innovation in (0.0, 4.0, 4.0, 4.0):
+        watch_steps(state, p, innovation, speed, 0.004 + gap_s * (innovation == 0.0))
+    assert state["stepping"]["opened"] == opens
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("angle_um", [-60.0, 60.0, 100.0])
+def test_a_torque_with_an_error_that_lasts_tells_within_a_stroke_what_that_does_not_explain(p, angle_um, seed):
+    """One that is other in other stops, by a fiftieth of the force, contradicts a force that is a fifth off as soon as contact
+    is made."""
+    p["torque_lasting_sigma"] = 0.02
+    rows, force = _drive(p, stops=_BEFORE + 2, seed=seed, angle_m=1e-6 * angle_um)
+    estimates = estimate(rows, p)
+    error, large = np.abs(estimates["force"] - force), np.arange(len(rows)) >= _BEFORE * _STOP
+    silent = large & (error > 1000.0) & (estimates["reasons"] == 0)
+    assert np.count_nonzero(large & (error > 1000.0)) > 50, "nothing to judge"
+    assert np.count_nonzero(silent) < 50
+    assert np.mean(error[large] > 3.0 * np.hypot(estimates["sigma"][large], 25.0)) < 0.1
 
 
 @pytest.mark.parametrize("times", [4.0, 6.0])

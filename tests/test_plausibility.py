@@ -11,6 +11,7 @@ from city import BEFORE_RELEASE, CLAMPING, HOLDING, RELEASED, drive, estimated
 
 from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.estimator.status import TORQUE_OLD
 from emb_daemon.offline import estimate, log_of
 from emb_daemon.plant.derive import plant_from_calibration
 from emb_daemon.plant.scenarios import accelerate, rest, simulate_log, stop
@@ -217,6 +218,7 @@ def test_stuck_resolver_is_named_and_torque_goes_on(begin, names):
     assert begin < named < moved + 15
     during = slice(named, begin + _LASTING)
     assert np.all(estimates["source"][during] == r.TORQUE_ONLY) and np.all(estimates["reasons"][during] & r.STUCK)
+    assert not np.any(estimates["facts"][during] & TORQUE_OLD)
     assert _honest(estimates, force, during) and np.median(estimates["sigma"][during]) > 500.0
     assert _recovered(estimates, force)
 

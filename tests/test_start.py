@@ -7,6 +7,7 @@ import pytest
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.contact import _start_clamped, seek_release
 from emb_daemon.estimator.records import ESTIMATE, new_state
+from emb_daemon.estimator.status import TORQUE_OLD
 from emb_daemon.estimator.step import step
 from emb_daemon.models.fusion import CONTACT, FAST, NOISE, OFFSET, SCALE
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
@@ -255,6 +256,25 @@ def test_what_pads_may_remember_of_a_stop_before_the_start_is_covered_until_they
     assert np.all(estimates["sigma"][late] < 1.1 * p["stiffness_sigma"]) and error[late].max() < p["stiffness_sigma"]
 
 
+def test_what_pads_remember_of_a_stop_that_a_frozen_resolver_has_not_shown_is_covered(p):
+    """They relax over three seconds. The angle freezes, with noise in the speed, before a stop, and goes on at its end."""
+    p["effects"]["second_relaxation"]["share"], p["effects"]["second_relaxation"]["time_constant_s"] = 0.1, 3.0
+    path = brake.stops(p, 4, held_s=4.0)
+    rows, force = brake.samples(p, path, creep=(0.1, 3.0))
+    rows = brake.noisy(rows, p)
+    stop = len(path) // 4
+    frozen = slice(2 * stop, 2 * stop + int(np.flatnonzero(force[2 * stop : 3 * stop] > 1000.0)[-1]) - 100)
+    rows["angle"][frozen] = rows["angle"][2 * stop - 1]
+    rows["speed"][frozen] = np.random.default_rng(1).normal(0.0, p["speed_sigma"], frozen.stop - frozen.start)
+    estimates = estimate(rows, p)
+    back = np.arange(len(rows)) > frozen.stop
+    error = np.abs(estimates["force"] - force)
+    usable = estimates["source"] != r.INVALID
+    assert np.mean((error > 3.0 * np.hypot(estimates["sigma"], 25.0))[back & usable]) < 0.01
+    believed = back & (estimates["source"] == r.FUSED)
+    assert np.mean(believed[frozen.stop :]) > 0.5
+
+
 def test_after_a_restart_the_time_since_the_snapshot_tells_what_pads_may_remember(p):
     """A daemon that ran ten seconds ago may have stopped just after a stop; one that ran a quarter of an hour ago has not."""
     p["effects"]["second_relaxation"]["share"], p["effects"]["second_relaxation"]["time_constant_s"] = 0.1, 3.0
@@ -428,6 +448,8 @@ def test_while_only_the_contact_is_unknown_friction_follows_the_motion(p, status
     friction = (p["offset_friction"] + p["load_friction"] * force) / p["gear_gain"]
     assert moving.sum() > 1000 and _rms((estimates["force"] - force)[moving]) < 0.3 * _rms(friction[moving])
     assert _covered(estimates, force)
+    # What answers is not said to be silent.
+    assert not np.any(estimates["facts"][_unknown(estimates)] & TORQUE_OLD)
 
 
 def test_a_torque_at_power_on_may_be_a_clamped_brake_or_an_offset_of_as_much(p, unknown):

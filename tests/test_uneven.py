@@ -24,10 +24,11 @@ def p(parameters):
     return p
 
 
-def _stops(p, cosine_um, sine_um, seed=1):
-    """Samples and true force of stops on a turning disc whose thickness varies. Its motor goes as on an even one."""
+def _stops(p, cosine_um, sine_um, seed=1, turns=0.0):
+    """Samples and true force of stops on a turning disc whose thickness varies. Its motor goes as on an even one. ``turns``
+    since the wheel's counter began."""
     path = brake.stops(p, _STOPS, seed)
-    turned = _TURNING * 0.004 * np.arange(len(path))
+    turned = 2.0 * np.pi * turns + _TURNING * 0.004 * np.arange(len(path))
     thicker = 1e-6 * (cosine_um * np.cos(turned) + sine_um * np.sin(turned)) / p["gear_gain"]
     rows, even = brake.samples(p, path)
     force = brake.samples(p, path + thicker)[1]
@@ -52,6 +53,65 @@ def test_an_uneven_disc_is_followed_after_some_stops(p, cosine_um, sine_um):
     missed = (even - force)[late][clamped]
     assert np.sqrt(np.mean(error**2)) < 0.35 * np.sqrt(np.mean(missed**2))
     assert np.mean(np.abs(error) > 3.0 * np.hypot(estimates["sigma"][late][clamped], 25.0)) < 0.01
+
+
+def _knows(p, cosine_um, sine_um):
+    """Parameters of a brake whose calibration knows the disc."""
+    p = p.copy()
+    p["effects"]["disc_thickness_variation"]["order_1_cosine_um"] = cosine_um
+    p["effects"]["disc_thickness_variation"]["order_1_sine_um"] = sine_um
+    return p.reshape(1)
+
+
+@pytest.mark.parametrize("turns", [0.5, 17.0, 42.5, 60.0, 100.0, 128.5])
+def test_a_counter_that_has_run_before_leaves_three_phases_open_and_torque_decides(p, turns):
+    """The counter goes over its range every 42.67 turns, which who starts later has not seen. Once decided, force and sigma
+    are as of a daemon that has heard it all."""
+    rows, force, even = _stops(p, 14.0, -9.0, turns=turns)
+    estimates = estimate(rows, _knows(p, 14.0, -9.0))
+    heard = estimate(_stops(p, 14.0, -9.0)[0], _knows(p, 14.0, -9.0))
+    error, clamped = np.abs(estimates["force"] - force), force > 1000.0
+    assert np.mean((error > 3.0 * np.hypot(estimates["sigma"], 25.0))[clamped]) < 0.01
+    late = clamped & (np.arange(len(rows)) >= _STOPS // 2 * _STOP)
+    assert np.sqrt(np.mean(error[late] ** 2)) < 0.1 * np.sqrt(np.mean((even - force)[late] ** 2))
+    assert np.median(estimates["sigma"][late]) < 1.1 * np.median(heard["sigma"][late])
+
+
+def test_without_a_torque_open_phases_stay_open_and_sigma_covers_the_disc(p):
+    rows, force, even = _stops(p, 14.0, -9.0, turns=60.0)
+    # The first stop shows the contact, but nothing of a disc that seems to stand.
+    rows["has_current"][_STOP:], rows["wheel_speed"][:_STOP] = False, 0.0
+    estimates, plain = estimate(rows, _knows(p, 14.0, -9.0)), estimate(rows, p.reshape(1))
+    late = (force > 1000.0) & (np.arange(len(rows)) >= 2 * _STOP)
+    missed = np.sqrt(np.mean((even - force)[late] ** 2))
+    assert np.sqrt(np.mean((estimates["force"] - force)[late] ** 2)) < 1.2 * missed
+    # Both are as unsure of the contact.
+    added = np.sqrt(np.mean((estimates["sigma"] ** 2 - plain["sigma"] ** 2)[late]))
+    assert added == pytest.approx(missed, rel=0.3)
+
+
+def test_a_counter_that_begins_with_the_daemon_tells_the_phase(p):
+    """Nothing is doubted, and the first stop is right."""
+    rows, force, even = _stops(p, 14.0, -9.0)
+    estimates = estimate(rows, _knows(p, 14.0, -9.0))
+    first = (force > 1000.0) & (np.arange(len(rows)) < _STOP)
+    assert np.sqrt(np.mean((estimates["force"] - force)[first] ** 2)) < 0.2 * np.sqrt(np.mean((even - force)[first] ** 2))
+
+
+def test_a_phase_lost_while_the_counter_was_silent_is_found_again(p):
+    """Counter and speed are silent for ten seconds in which the disc turns forty times; for half a second it is not lost."""
+    rows, force, even = _stops(p, 14.0, -9.0)
+    heard = estimate(rows, _knows(p, 14.0, -9.0))
+    short, silent = slice(_STOP, _STOP + 125), slice(3 * _STOP, 3 * _STOP + 2500)
+    for silence in (short, silent):
+        rows["has_wheel_pulse"][silence] = rows["has_wheel_speed"][silence] = False
+    estimates = estimate(rows, _knows(p, 14.0, -9.0))
+    between = slice(short.stop + 250, silent.start)
+    np.testing.assert_allclose(estimates["sigma"][between], heard["sigma"][between], rtol=0.05)
+    error, clamped = np.abs(estimates["force"] - force), force > 1000.0
+    assert np.mean((error > 3.0 * np.hypot(estimates["sigma"], 25.0))[clamped]) < 0.01
+    late = clamped & (np.arange(len(rows)) >= (_STOPS - 2) * _STOP)
+    assert np.sqrt(np.mean(error[late] ** 2)) < 0.1 * np.sqrt(np.mean((even - force)[late] ** 2))
 
 
 @pytest.mark.parametrize("seed", range(1, 5))

@@ -343,8 +343,9 @@ def _describe(selection: Selection, candidate: Candidate) -> Candidate:
 
 
 def _why(candidate: Candidate) -> str:
-    over = "the whole grammar" if candidate.names else "episodes"
-    text = f"q = {candidate.q_value:.1g} over {over}, gains {candidate.gain:.3g} {UNITS[candidate.channel]} on left-out ones"
+    over = "the whole grammar" if candidate.names else "turns of the disc" if candidate.effect.by_turns else "episodes"
+    gain = f"{candidate.gain:.3g} {UNITS[candidate.channel]}"
+    text = f"q = {candidate.q_value:.1g} over {over}, gains {gain} on left-out episodes"
     if candidate.in_calibration:
         text = f"not as calibrated: {text}"
     for disturbed, share in candidate.placebos.items():

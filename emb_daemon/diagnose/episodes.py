@@ -2,7 +2,8 @@
 
 Residuals at 250 Hz are autocorrelated over seconds, so that neighbouring samples contain no new information, while different
 stops are nearly independent. A log is therefore cut into brake applications, each with the pause before it, and long motion (a
-drag, a burst, a park brake stroke) into pieces of a few seconds; a hold is one episode however long it is.
+drag, a burst, a park brake stroke) into pieces of a few seconds; a hold is one episode however long it is. Only what follows
+the disc's angle comes again in it, turn by turn.
 """
 
 from itertools import pairwise
@@ -52,6 +53,29 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> 
         if time_s[cut] - time_s[apart[-1]] >= _SHORTEST_S:
             apart.append(cut)
     return np.searchsorted(apart, np.arange(len(time_s)), side="right") - 1
+
+
+def by_turns(episode: np.ndarray, time_s: np.ndarray, wheel_rad: np.ndarray) -> np.ndarray:
+    """The same episodes, long ones cut after whole turns of the disc: an error that lasts throughout a hold is the same at
+    every angle of the disc, so that what follows that angle has been seen anew in each part.
+
+    Args:
+        episode: number of each sample's episode, ascending from 0, shape (N,).
+        time_s: sample times, shape (N,).
+        wheel_rad: angle of the wheel, unwrapped, shape (N,).
+    """
+    cuts = np.zeros(len(episode), np.int64)
+    begins = np.flatnonzero(np.diff(episode, prepend=-1))
+    for start, stop in pairwise([*begins.tolist(), len(episode)]):
+        turns = np.floor(np.abs(wheel_rad[start:stop] - wheel_rad[start]) / (2.0 * np.pi))
+        whole = np.flatnonzero(np.diff(turns) > 0.0) + 1 + start
+        last = start
+        while (later := whole[np.searchsorted(time_s[whole], time_s[last] + _LONGEST_S) :]).size:
+            if time_s[stop - 1] - time_s[later[0]] < _LONGEST_S:
+                break
+            last = later[0]
+            cuts[last] = 1
+    return episode + np.cumsum(cuts)
 
 
 def _applications(time_s: np.ndarray, force_N: np.ndarray) -> list[int]:

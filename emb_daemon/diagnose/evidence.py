@@ -7,7 +7,8 @@ the regressor (Carter, Schnepel, Steigerwald, Rev. Economics and Statistics 99, 
 no part in the fit.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -64,6 +65,11 @@ class Moments:
         """The same for some of the columns."""
         keep = np.array([*columns, self.products.shape[1] - 1])
         return Moments(self.products[:, keep[:, None], keep[None, :]], self.counts)
+
+    def squared_error(self, values: np.ndarray) -> float:
+        """That ``values`` of the regressors, shape (columns,), leave of the residual over all episodes."""
+        weights = np.append(values, -1.0)
+        return float(weights @ self.products.sum(axis=0) @ weights)
 
 
 @dataclass(frozen=True)
@@ -142,6 +148,7 @@ class Evidence:
     Attributes:
         p_value: of "all its parameters are zero".
         gain: fall of the squared error summed over left-out episodes.
+        agreement: ``gain`` as a share of what the error falls by where nothing is left out.
         clusters: effective number of episodes that carry it.
         values, sigmas: of its parameters.
     """
@@ -151,8 +158,12 @@ class Evidence:
     clusters: float
     values: np.ndarray
     sigmas: np.ndarray
+    agreement: float = 0.0
 
 
+#: Least agreement of episodes, so that turns of the disc count: what has another phase in each of 3 to 6 holds reaches it in 4
+#: of 100, what follows the disc has 0.98 and more.
+_AGREE = 0.7
 NOT_EXCITED = Evidence(1.0, 0.0, 0.0, np.zeros(0), np.zeros(0))
 
 
@@ -171,8 +182,11 @@ def judge(
     if np.any(own <= 0.0) or not np.isfinite(total).all():
         return NOT_EXCITED
     fitted = leave_out(both, penalty[nuisances + candidate])
-    plain = leave_out(base, penalty[nuisances]).left_out if plain is None else plain
+    without = leave_out(base, penalty[nuisances])
+    plain = without.left_out if plain is None else plain
     gain = float((plain - fitted.left_out).sum())
+    fall = base.squared_error(without.values) - both.squared_error(fitted.values)
+    agreement = gain / fall if fall > 0.0 else 0.0
     # Project the nuisances out, to see how much of the candidate is its own and which episodes carry it.
     normal = total[:first, :first] + np.diag(penalty[nuisances])
     shadow = np.linalg.lstsq(normal, total[:first, first:-1], rcond=1e-12)[0] if first else np.zeros((0, count))
@@ -189,8 +203,18 @@ def judge(
     clusters = float(leverage.sum() ** 2 / np.maximum((leverage**2).sum(), 1e-300))
     values, covariance = fitted.values[first:], fitted.covariance[first:, first:]
     freedom = clusters - count
-    if freedom < 2.0:
-        return Evidence(1.0, gain, clusters, values, np.sqrt(np.diag(covariance)))
-    statistic = float(values @ np.linalg.pinv(covariance, rcond=1e-12) @ values)
-    p_value = float(f.sf(statistic * freedom / (count * max(clusters - 1.0, 1.0)), count, freedom))
-    return Evidence(p_value, gain, clusters, values, np.sqrt(np.diag(covariance)))
+    p_value = 1.0
+    if freedom >= 2.0:
+        statistic = float(values @ np.linalg.pinv(covariance, rcond=1e-12) @ values)
+        p_value = float(f.sf(statistic * freedom / (count * max(clusters - 1.0, 1.0)), count, freedom))
+    return Evidence(p_value, gain, clusters, values, np.sqrt(np.diag(covariance)), agreement)
+
+
+def judge_by_turns(judged: Callable[[bool], Evidence]) -> Evidence:
+    """Evidence of what follows the disc's angle; ``judged``: (whether by turns) → evidence, over episodes otherwise. Where
+    episodes agree each turn of the disc is an observation of its own; the gain is that of left-out episodes all the same."""
+    evidence = judged(False)
+    if evidence.agreement < _AGREE:
+        return evidence
+    often = judged(True)
+    return replace(evidence, p_value=often.p_value, clusters=often.clusters)

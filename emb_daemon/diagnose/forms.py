@@ -278,6 +278,12 @@ def _shapes(port: str, signal: str, low: float, high: float) -> Iterator[_Shape]
             yield "lag", "odd_power", reach, 0.0, 1.0, time
         yield from _peaks(reach, centre)
         return
+    yield from _of_others(port, signal, low, high, centre)
+
+
+def _of_others(port: str, signal: str, low: float, high: float, centre: float) -> Iterator[_Shape]:
+    """`_shapes` of signals that are like any other at their port."""
+    width, reach, farthest = high - low, max(abs(low), abs(high)), max(abs(low - centre), abs(high - centre))
     signed = low < 0.0 and signal not in TEMPERATURES
     even = port in ("torque_constant", "gear_friction", "gear_gain") and signed
     for exponent in _EXPONENTS:

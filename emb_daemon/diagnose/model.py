@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle, base_coordinates, effect_coordinates
-from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, leave_out, leave_out_within
+from emb_daemon.diagnose.evidence import Averaging, Evidence, Moments, judge, judge_by_turns, leave_out, leave_out_within
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, HEAT_CHANNELS, SIDE_BY_SIDE, Bench, Probe
 from emb_daemon.diagnose.unexplained import noise_of_means
 from emb_daemon.effects import REGISTRY
@@ -254,11 +254,21 @@ class Model:
         return self._variance(channel) / prior**2
 
     def moments(
-        self, channel: str, columns: Sequence[np.ndarray], residual: np.ndarray | None = None, samples: int = 1
+        self,
+        channel: str,
+        columns: Sequence[np.ndarray],
+        residual: np.ndarray | None = None,
+        samples: int = 1,
+        turns: bool = False,
     ) -> Moments:
-        """Of regressors, (N,) or (N, k) each, and the channel's residual or another, as means over so many ``samples``."""
+        """Of regressors, (N,) or (N, k) each, and the channel's residual or another, as means over so many ``samples``.
+        ``turns``: episodes are cut by turns of the disc."""
         residual = self.residual[channel] if residual is None else residual
-        table, episode = np.column_stack([*columns, residual]), self.bench.episode[channel]
+        table = np.column_stack([*columns, residual])
+        if turns:
+            episode = self.bench.turns
+            return Moments.of(table[:, :-1], table[:, -1], episode, int(episode[-1]) + 1)
+        episode = self.bench.episode[channel]
         if samples > 1:
             means = self.bench.means(channel, samples)
             table, episode = means.of(table), means.episode
@@ -279,14 +289,27 @@ class Model:
         return leave_out(moments, self.penalty(free, channel)).left_out
 
     def evidence(
-        self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = (), samples: int = 1
+        self,
+        channel: str,
+        own: Sequence[np.ndarray],
+        given: Sequence[np.ndarray] = (),
+        samples: int = 1,
+        turns: bool = False,
     ) -> Evidence:
-        """Of regressors that are not in the model, everything in it and ``given`` ones free; of means over ``samples``."""
+        """Of regressors that are not in the model, everything in it and ``given`` ones free; of means over ``samples``.
+
+        ``turns``: how probable they are by chance is judged by turns of the disc, which a rig that turns it for minutes during
+        a few brake applications has seen often; their gain by whole episodes all the same."""
         free = self.movable(channel)
-        moments = self.moments(channel, [*(self.columns[c] for c in free), *given, *own], samples=samples)
+        columns = [*(self.columns[c] for c in free), *given, *own]
         penalty = np.concatenate([self.penalty(free, channel), np.zeros(len(given) + len(own))])
         first = len(free) + len(given)
-        return judge(moments, list(range(first)), list(range(first, first + len(own))), penalty)
+        parts = list(range(first)), list(range(first, first + len(own)))
+
+        def judged(by: bool) -> Evidence:
+            return judge(self.moments(channel, columns, None, samples, by), *parts, penalty)
+
+        return judge_by_turns(judged) if turns else judged(False)
 
     def evidence_against(self, values: Values, samples: int = 1) -> Evidence:
         """That some fitted coordinates of one channel stand elsewhere than at ``values``, everything else free; of means over
@@ -299,14 +322,18 @@ class Model:
         rest = [c for c in self.movable(channel) if c not in values and (c.effect not in effects or not is_shape(c))]
         start = {c: self.centre.get(c, c.start) for c in rest}
         restored = self.residual_at(channel, start | dict(values))
-        moments = self.moments(channel, [self.columns[c] for c in (*rest, *tested)], restored, samples)
         first, penalty = len(rest), self.penalty([*rest, *tested], channel)
         nuisances, (low, high) = (
             list(range(first)),
             np.array([(c.low - start[c], c.high - start[c]) for c in rest]).reshape(-1, 2).T,
         )
-        plain = leave_out_within(moments.select(nuisances), penalty[:first], low, high) if rest else None
-        return judge(moments, nuisances, list(range(first, len(penalty))), penalty, plain)
+
+        def judged(turns: bool) -> Evidence:
+            moments = self.moments(channel, [self.columns[c] for c in (*rest, *tested)], restored, samples, turns)
+            plain = leave_out_within(moments.select(nuisances), penalty[:first], low, high) if rest else None
+            return judge(moments, nuisances, list(range(first, len(penalty))), penalty, plain)
+
+        return judge_by_turns(judged) if effects and effects <= _OF_TURNS else judged(False)
 
     def log_posterior(self, channel: str, samples: int, scale: float) -> float:
         """Of a channel's free coordinates where means over ``samples`` make them most probable, in nats but for a constant;
@@ -330,6 +357,7 @@ class Model:
         return float(np.sqrt(max(gain, 0.0) / self.counted(channel)))
 
 
+_OF_TURNS = {effect.name for effect in REGISTRY if effect.by_turns}
 _SHAPES = {f"effects.{effect.name}.{parameter.name}" for effect in REGISTRY for parameter in effect.shapes}
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from emb_daemon.calibration.parameters import CLEARANCE, CLEARANCE_SIGMA, moved
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import HISTORY_TIME, Coordinate, Values, by_key
-from emb_daemon.diagnose.episodes import episodes, standing, yielding
+from emb_daemon.diagnose.episodes import by_turns, episodes, standing, yielding
 from emb_daemon.diagnose.evidence import Averaging
 from emb_daemon.diagnose.held_heat import run_held, run_with_heat
 from emb_daemon.diagnose.speeds import denoised
@@ -29,6 +29,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.logs.currents import current_late_ms
 from emb_daemon.logs.series import Series
+from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline.log import Log
 from emb_daemon.offline.run import held, run_paths, run_step
 from emb_daemon.wire.contract import CYCLE_S
@@ -319,6 +320,11 @@ class Bench:
     def episodes(self) -> int:
         """Their number."""
         return int(self.sample_episode[-1]) + 1
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """The same for what follows the angle of the disc (`by_turns`)."""
+        return count_over([by_turns(trial.episode, trial.log.time_s, wheel_angle(trial.log.samples)) for trial in self.trials])
 
     @cached_property
     def episode(self) -> dict[str, np.ndarray]:

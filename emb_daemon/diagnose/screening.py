@@ -198,7 +198,7 @@ class Screening:
         for shape in shapes:
             for part in parts:
                 regressors = tuple(columns[Probe(c, shape)] for c in part)
-                evidence = model.evidence(channel, regressors)
+                evidence = model.evidence(channel, regressors, turns=effect.by_turns)
                 earlier = best.evidence
                 if not best.columns or (evidence.p_value, -evidence.gain) < (earlier.p_value, -earlier.gain):
                     best = Candidate(effect, channel, tuple(part), shape, regressors, evidence)
@@ -225,7 +225,8 @@ class Screening:
         if not candidate.columns or not len(evidence.values):
             return replace(candidate, reason=f"not excited by these logs; {effect.manoeuvre}")
         if candidate.q_value > Q_VALUE:
-            clusters = f"{evidence.clusters:.0f} effective episodes (q = {candidate.q_value:.2g})"
+            seen = "parts of whole turns of the disc" if effect.by_turns else "episodes"
+            clusters = f"{evidence.clusters:.0f} effective {seen} (q = {candidate.q_value:.2g})"
             return replace(candidate, reason=f"not significant over {clusters}")
         return self.plausible(model, candidate, rivals, tested)
 

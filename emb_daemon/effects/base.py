@@ -228,6 +228,11 @@ class Effect:
         """Parameters that only shape it."""
         return tuple(parameter for parameter in self.parameters if parameter.starts)
 
+    @property
+    def by_turns(self) -> bool:
+        """Whether each turn of the disc shows it anew, so that chance counts those and not episodes."""
+        return self.signal == "disc_angle"
+
     def parameter(self, name: str) -> Parameter:
         return next(parameter for parameter in self.parameters if parameter.name == name)
 

@@ -2,14 +2,17 @@
 
 The wheel angle comes from the wheel's pulse counter, carried on by the wheel speed between its messages. Its zero is where
 the counter was at power-on, which is arbitrary, so each order has a cosine and a sine.
+
+The counter's range is no whole number of turns. Who has not heard it go over its range cannot know which of `PHASES` phases
+the disc has; the thickness is then their mean by how likely they are (`estimator.phases`), and sigma their spread.
 """
 
-from math import cos, pi, sin, sqrt
+from math import cos, gcd, pi, sin, sqrt
 
 import numpy as np
 
 from emb_daemon.effects.base import Effect, Parameter, Placebo
-from emb_daemon.jit import Record, njit
+from emb_daemon.jit import Record, hypot, njit
 from emb_daemon.models.wheel import WHEEL, track
 from emb_daemon.wire.contract import PULSE_MODULO, PULSES_PER_TURN
 
@@ -18,13 +21,24 @@ ORDERS = 4
 _COMMON_ORDERS = 2
 #: Error of the wheel speed while the counter does not correct it: a hundredth, and half a count on the bus, rad/s.
 _SPEED_ERROR, _SPEED_ERROR_RAD_PER_S = 0.01, 0.025
+#: What a wheel of a car may turn at, rad/s: 65 m/s on tyres of 0.33 m.
+_FASTEST_RAD_PER_S = 200.0
+#: Phases that a counter leaves open once it may have gone over its range, and what one is ahead of the one before, rad.
+PHASES = PULSES_PER_TURN // gcd(PULSE_MODULO, PULSES_PER_TURN)
+_AHEAD_RAD = 2.0 * pi * PULSE_MODULO / PULSES_PER_TURN
+#: What a counter that begins with the daemon may stand at when it is first heard: a count, and what the wheel turns by in two
+#: cycles of the message, s. One that has run for long stands there by chance once in 2000 times at rest, in 200 at 60 rad/s.
+_JUST_BEGUN, _JUST_S = 1, 0.02
 #: Phase error, rad, from which the mean thickness is the better estimate; and half of the counter's range, from which the turn
 #: is unknown.
 _GUESSED_RAD, _LOST_RAD = 1.0, pi * PULSE_MODULO / PULSES_PER_TURN
 
 #: ``unseen``: possible phase error (rad) since the last value of the counter; ``sigma``: standard deviation of the thickness
-#: (m) that follows.
-_STATE = np.dtype([("wheel", WHEEL), ("unseen", "f8"), ("sigma", "f8")], align=True)
+#: (m) that follows; ``likely``: probability of each phase that is open, zeros where the phase is known; ``beside``: by how
+#: much the disc is thicker with each of them than the mean, m.
+_STATE = np.dtype(
+    [("wheel", WHEEL), ("unseen", "f8"), ("sigma", "f8"), ("likely", "f8", (PHASES,)), ("beside", "f8", (PHASES,))], align=True
+)
 
 
 @njit
@@ -35,16 +49,48 @@ def _amplitudes(p):
 
 
 @njit
-def term(p: Record, s: Record, m: Record) -> float:
-    """Disc thickness in m above its mean, where the pads stand."""
+def _steepness(p):
+    """Twice the mean square of the slope over the angle, µm²/rad²."""
     cosines, sines = _amplitudes(p)
-    # Twice the mean square of the slope over the angle, µm²/rad².
     square = 0.0
     for k in range(ORDERS):
         square += (k + 1) * (k + 1) * (cosines[k] * cosines[k] + sines[k] * sines[k])
+    return square
+
+
+@njit
+def _thickness(cosines, sines, angle):
+    """Thickness in m above the mean at a wheel angle."""
+    thickness = 0.0
+    for k in range(ORDERS):
+        thickness += cosines[k] * cos((k + 1) * angle)
+        thickness += sines[k] * sin((k + 1) * angle)
+    return 1e-6 * thickness
+
+
+@njit
+def is_open(s: Record) -> bool:
+    """Whether several phases are possible."""
+    return s.likely[0] > 0.0
+
+
+@njit
+def _open(s):
+    for phase in range(PHASES):
+        s.likely[phase] = 1.0 / PHASES
+
+
+@njit
+def term(p: Record, s: Record, m: Record) -> float:
+    """Disc thickness in m above its mean, where the pads stand."""
+    cosines, sines = _amplitudes(p)
+    square = _steepness(p)
     if square == 0.0:
         return 0.0
-    if m.has_wheel_pulse and s.unseen < _LOST_RAD:
+    if m.has_wheel_pulse:
+        if s.unseen >= _LOST_RAD:
+            s.wheel.known = False
+            _open(s)
         angle = track(s.wheel, m.wheel_pulse, m.wheel_speed if m.has_wheel_speed else 0.0, m.dt)
         s.unseen = 0.0
     elif s.wheel.known and m.has_wheel_speed:
@@ -53,17 +99,34 @@ def term(p: Record, s: Record, m: Record) -> float:
         s.unseen += (_SPEED_ERROR * m.wheel_speed + _SPEED_ERROR_RAD_PER_S) * m.dt
         angle = s.wheel.turned
     elif s.wheel.known:
-        s.unseen, angle = _LOST_RAD, 0.0
+        s.unseen += _FASTEST_RAD_PER_S * m.dt
+        angle = s.wheel.turned
     else:
         return 0.0
     s.sigma = 1e-6 * sqrt(0.5 * square) * min(s.unseen, 1.0)
     if s.unseen > _GUESSED_RAD:
         return 0.0
-    thickness = 0.0
-    for k in range(ORDERS):
-        thickness += cosines[k] * cos((k + 1) * angle)
-        thickness += sines[k] * sin((k + 1) * angle)
-    return 1e-6 * thickness
+    if not is_open(s):
+        return _thickness(cosines, sines, angle)
+    mean = variance = 0.0
+    for phase in range(PHASES):
+        s.beside[phase] = _thickness(cosines, sines, angle + phase * _AHEAD_RAD)
+        mean += s.likely[phase] * s.beside[phase]
+    for phase in range(PHASES):
+        s.beside[phase] -= mean
+        variance += s.likely[phase] * s.beside[phase] * s.beside[phase]
+    s.sigma = hypot(s.sigma, sqrt(variance))
+    return mean
+
+
+@njit
+def doubt_phase(p: Record, s: Record, m: Record) -> None:
+    """Before the first sample with the counter: one that stands at more than it can have counted just now has run before, and
+    may have gone over its range."""
+    if m.has_wheel_pulse and not s.wheel.known and _steepness(p) > 0.0:
+        speed = m.wheel_speed if m.has_wheel_speed else 0.0
+        if m.wheel_pulse > _JUST_BEGUN + _JUST_S * speed * PULSES_PER_TURN / (2.0 * pi):
+            _open(s)
 
 
 def _from_anywhere(samples, episode, random):

@@ -9,11 +9,13 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from emb_daemon import effects
-from emb_daemon.effects import terms
+from emb_daemon.effects import disc_thickness_variation, terms
 from emb_daemon.effects.base import HOOKS, Hook
 from emb_daemon.jit import Record, njit
 from emb_daemon.models.thermal import Altered
 
+#: Number of phases that may be open.
+PHASES = disc_thickness_variation.PHASES
 #: Called with the quantity where the hook has no start, parameters and states of all effects, and the hook's arguments.
 _Hook: TypeAlias = Callable[..., float]
 #: Least factor on a conductance or a share of heat that is left: heat never flows uphill.
@@ -110,6 +112,36 @@ def heat_balance(e: Record, s: Record, dt: float) -> Altered:
         _pad_heat(e, s, dt),
         _disc_heat(e, s, dt),
     )
+
+
+@njit
+def doubt_phase(e: Record, s: Record, m: Record) -> None:
+    """Before the first samples of a daemon that may have been started at any time: whether the disc's phase is known."""
+    disc_thickness_variation.doubt_phase(e.disc_thickness_variation, s.disc_thickness_variation, m)
+
+
+@njit
+def open_phases(s: Record) -> bool:
+    """Whether the disc may have one of several phases."""
+    return disc_thickness_variation.is_open(s.disc_thickness_variation)
+
+
+@njit
+def beside(s: Record, phase: int) -> float:
+    """By how much (m) the disc is thicker, if it has one of the open phases, than it is taken for."""
+    return s.disc_thickness_variation.beside[phase]
+
+
+@njit
+def likely(s: Record, phase: int) -> float:
+    """Probability of one of the open phases."""
+    return s.disc_thickness_variation.likely[phase]
+
+
+@njit
+def believe(s: Record, phase: int, probability: float) -> None:
+    """That one of the open phases is the disc's, with a probability from now on."""
+    s.disc_thickness_variation.likely[phase] = probability
 
 
 @njit

@@ -6,7 +6,7 @@ import numpy as np
 
 from emb_daemon.estimator.fuse import needed_torque
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
-from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, doubt_memory, rest, turned
+from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, doubt_memory, ordinary_stop, rest, turned
 from emb_daemon.estimator.resolver import nobody_brakes
 from emb_daemon.estimator.rewind import keep_all
 from emb_daemon.estimator.unknown import offset_walk
@@ -63,7 +63,7 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
     elif s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
         place_contact(s, p, m.angle)
         # It was clamped until now, perhaps.
-        doubt_memory(s, p, 1.0, 0.0)
+        doubt_memory(s, p, ordinary_stop(p, 1.0), 0.0)
         s.unknown, s.start_angle = False, m.angle
         if not loose:
             # A released brake is not held for so long: the measured current is an offset of the sensor.

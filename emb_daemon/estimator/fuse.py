@@ -29,9 +29,12 @@ from emb_daemon.estimator.hypotheses import (
     to_force,
     to_torque,
     unproven,
+    watch_steps,
     weigh,
+    weigh_step,
 )
 from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, SELF_LOCKING, crept, disc_warmth
+from emb_daemon.estimator.phases import follow_phases, undecided, weigh_phases
 from emb_daemon.estimator.rewind import keep
 from emb_daemon.estimator.status import (
     ANGLE_LATE,
@@ -108,6 +111,8 @@ _NOTED = 0.003
 #: Share of the largest force from which a model error is reported. Sigma contains a smaller one, and is itself not reported
 #: from less than this.
 _NOTED_ERROR = 0.01
+#: Offset of the motor torque, over its standard deviation at power-on, beyond which no healthy current sensor is off.
+_OFFSET_LARGE = 2.0
 #: Part of a sample by which current and angle may differ in time, in addition to the angle's delay, which changes friction
 #: with it.
 _LATE = 0.3
@@ -122,6 +127,10 @@ _TOLD_CYCLES = 2.0
 #: Time for which an unexplained error of the torque is constant, s: until temperature and force of the brake are others, which
 #: takes some stops.
 _LASTS_S = 10.0
+#: Time over which a torque with such an error is averaged, s, shorter than a stroke; share of the variance of its noise that
+#: goes in that, if the noise is correlated over up to ten milliseconds; and squared standard deviations of what remains that
+#: are certain.
+_BEYOND_S, _AVERAGED, _SURELY = 0.05, 0.8, 9.0
 #: Share of the force, as standard deviation of the stiffness path, from which it tells none. A curve that is not measured up
 #: to the largest force is given one of all of it at most (`identify`); as much again are errors that logs have shown. Errors
 #: of that size last, and what motor and friction would learn beside them is wrong.
@@ -250,13 +259,18 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
         compare(s.alignment, s.motor_torque, wanted, wanted - p.inertia * (m.speed - s.speed) / m.dt, sqrt(moving))
     else:
         interrupt(s.alignment)
-    fast = h[FAST] * h[FAST] * s.covariance[FAST, FAST]
+    fast, followed = h[FAST] * h[FAST] * s.covariance[FAST, FAST], h[FAST] * s.error[FAST]
     periodic = leverage * uneven.applied(s.uneven)
     unexplained = torque - leverage * mean_force - periodic
     first, variance = learn(s.error, s.covariance, s.gain, h, unexplained, white, trusted)
     slow = max(variance - white - fast, 0.0)
     out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
     out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
+    s.beyond = first / leverage if trusted and m.angle != s.angle else np.nan
+    noise = (moving + sq(p.torque_constant * p.current_sigma)) / sq(leverage)
+    s.beyond_variance = max(sq(out.torque_sigma) - _AVERAGED * noise, 0.0)
+    if trusted and not known:
+        watch_steps(s, p, first / sqrt(variance), m.speed, m.dt)
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
         if not exists(a):
@@ -272,7 +286,10 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
             out.innovation, out.innovation_sigma = second / leverage, sqrt(variance_a) / leverage
     stay_finite(s)
     if trusted and not known and m.angle != s.angle and m.wheel_speed > TURNING_RAD_PER_S and not suspected(s):
-        uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
+        if effects.open_phases(s.effects):
+            weigh_phases(s.phases, s.effects, leverage, first + followed, variance - fast)
+        if not undecided(s.effects):
+            uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
     current = p.torque_constant * p.current_sigma
     slow += lasting * lasting
     return sqrt(moving + slow), sqrt(current * current + slow)
@@ -289,6 +306,7 @@ def fuse(
     warmth = disc_warmth(s)
     known, h, spread = p.clearance_sigma == 0.0, s.sensitivity[0], _spread(s, p, m)
     _predict(s, p, m, spread, warmth, known)
+    follow_phases(s.phases, s.effects, m, s.drive_slope, p.gear_gain, p.relaxation_time)
     uneven.turn(s.uneven, m, s.drive_slope, p.gear_gain, p.relaxation_time)
     if p.sensor.limit > 0.0 and not known:
         hear_sensor(s, p, m, h, spread, warmth, force_before)
@@ -310,19 +328,9 @@ def fuse(
         if trusted and m.angle != s.angle and out.innovation_sigma < _TELLING * p.maximum_force:
             remember(s.consistency, out.innovation, out.innovation_sigma, m.dt)
         s.torque_age = 0.0 if trusted or not _tells(p) else s.torque_age + m.dt
+        weigh_step(s, leverage)
         fold(s, warmth, True)
-        stops = s.stops
-        if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
-            fold(s, warmth, False)
-            open_others(s, p)
-            forget(s.consistency)
-            forget_level(s.contact)
-        if s.stops > stops:
-            weigh_common(s, p)
-            attribute_straying(s)
-            keep(s)
-        elif trusted and s.contact.engaged:
-            follow_common(s, p, m.dt)
+        _learn(s, p, m, trusted, known, warmth)
     else:
         s.torque_age += m.dt
     s.current_before, s.had_current = m.current_q, m.has_current
@@ -331,22 +339,68 @@ def fuse(
         open_again(s, p)
     out.force, out.sigma = mix(s, h, spread, warmth)
     if not known:
-        out.force += uneven.applied(s.uneven)
-        out.sigma = hypot(out.sigma, hypot(uneven.force_sigma(s.uneven), s.memory_sigma))
-        # Error of the travel from the released position by a resolver with a wrong gain.
-        out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
-        # What the zero strays by until torque has shown it.
-        strays = straying_sigma(s, _LASTS_S) + abs(s.wander.loss) * _STROKE_S * p.maximum_speed
-        out.sigma = hypot(out.sigma, s.slope * s.gear_slope * strays)
-        out.sigma = hypot(out.sigma, common_sigma(s, p) * out.force)
-        if s.past_contact <= 0.0:
-            # Whether pads that are apart still push with what they creep was never seen.
-            out.sigma = hypot(out.sigma, crept(s, 0.0))
+        if s.contact.engaged:
+            out.sigma = hypot(out.sigma, s.stepping.apart)
+        _follow_beyond(s, p, m, out)
+        _add_beside(s, p, m, out)
     # Not max(), which may return the number if the other is NaN, so that a broken estimate would look like an open brake.
     if out.force < 0.0:
         out.force = 0.0
     out.contact_sigma = contact_sigma(s)
     return turning_sigma, standing_sigma
+
+
+@njit
+def _follow_beyond(s, p, m, out):
+    """Where the torque has an error that lasts, which the hypotheses take for noise of so many samples: what the torque of a
+    turning motor has said of late beyond the fused force, and the variance of that."""
+    if not s.contact.engaged or p.torque_lasting_sigma == 0.0:
+        s.mean_beyond = s.beyond_square = 0.0
+    elif np.isfinite(s.beyond) and out.torque_sigma < _TELLING * p.maximum_force:
+        share = 1.0 - exp(-m.dt / _BEYOND_S)
+        s.mean_beyond += share * (s.beyond - (out.force - s.force) - s.mean_beyond)
+        s.beyond_square += share * (s.beyond_variance - s.beyond_square)
+    if contradicts(s):
+        out.sigma = hypot(out.sigma, s.mean_beyond)
+
+
+@njit
+def contradicts(s: Record) -> bool:
+    """Whether the torque says more, or less, than its error that lasts explains."""
+    return sq(s.mean_beyond) > _SURELY * s.beyond_square
+
+
+@njit
+def _learn(s, p, m, trusted, known, warmth):
+    """From a proven change, and from stops that have ended."""
+    stops = s.stops
+    if trusted and not known and settle(s, p, s.past_contact < -_BACK * p.clearance, m.dt):
+        fold(s, warmth, False)
+        open_others(s, p)
+        forget(s.consistency)
+        forget_level(s.contact)
+    if s.stops > stops:
+        weigh_common(s, p)
+        attribute_straying(s)
+        keep(s)
+    elif trusted and s.contact.engaged:
+        follow_common(s, p, m.dt)
+
+
+@njit
+def _add_beside(s, p, m, out):
+    """To force and sigma of all hypotheses what is beside them: the uneven disc, and errors that no hypothesis has."""
+    out.force += uneven.applied(s.uneven)
+    out.sigma = hypot(out.sigma, hypot(uneven.force_sigma(s.uneven), s.memory_sigma))
+    # Error of the travel from the released position by a resolver with a wrong gain.
+    out.sigma = hypot(out.sigma, s.slope * s.gear_slope * s.lateness.gain * (m.angle - s.gear_zero))
+    # What the zero strays by until torque has shown it.
+    strays = straying_sigma(s, _LASTS_S) + abs(s.wander.loss) * _STROKE_S * p.maximum_speed
+    out.sigma = hypot(out.sigma, s.slope * s.gear_slope * strays)
+    out.sigma = hypot(out.sigma, common_sigma(s, p) * out.force)
+    if s.past_contact <= 0.0:
+        # Whether pads that are apart still push with what they creep was never seen.
+        out.sigma = hypot(out.sigma, crept(s, 0.0))
 
 
 @njit
@@ -391,11 +445,20 @@ def _torque_alone(s, p, m):
     gain, load friction (m/rad) and offset friction (N m)."""
     slope, slope_unsure, spring, spring_unsure = _beside_force(s, p)
     gain, load, coulomb = _gear(s, p, m, s.error, slope)
-    torque = _motor_torque(s, s.error)
+    learned = torque = _motor_torque(s, s.error)
+    if s.plausibility.verdict == STIFFNESS_WRONG:
+        # Beside a wrong angle the motor seemed to have whatever offset made up for it: only what a current sensor may have is
+        # taken off.
+        most = _OFFSET_LARGE * torque_offset(p)
+        torque += s.error[OFFSET] - min(max(s.error[OFFSET], -most), most)
     force, sigma = force_of_torque_alone(s.plausibility, torque, m.has_current, m.dt, gain, load, coulomb, spring)
     sigma = hypot(sigma, hypot(sqrt(s.covariance[OFFSET, OFFSET]) / gain, p.torque_lasting_sigma * force))
     if slope_unsure > 0.0 or spring_unsure > 0.0:
         sigma = hypot(sigma, hypot(slope_unsure * (force + spring), spring_unsure))
+    if s.plausibility.verdict == STIFFNESS_WRONG:
+        friction = max(p.offset_friction - coulomb, 0.0) + max(p.load_friction * slope - load, 0.0) * force
+        # The resolver may have been wrong for a while, and what motor and friction have learned beside it.
+        sigma = hypot(sigma, hypot(learned - s.motor_torque, friction) / gain)
     return force, sigma, torque - gain * spring, gain, load, coulomb
 
 
@@ -444,14 +507,45 @@ def _least_beyond_friction(s, p, m, accelerating, spread):
 
 
 @njit
+def _count_against_resolver(s, p, m, turning_sigma, standing_sigma, torque, gain, load, coulomb, out):
+    """Counts what the torque says against the angle, by `take_sides`' sigmas and `_torque_alone`'s torque and gear: 1 if a
+    motor that seems to stand has more torque than friction carries, 2 if that proves that it turned, else 0."""
+    c, swings = s.plausibility, 0
+    accelerating = p.inertia * (m.speed - s.speed) / m.dt if m.dt > 0.0 else 0.0
+    if m.has_current:
+        steady(c, _motor_torque(s, s.error), accelerating, m.dt)
+    if m.has_current and stands(c, m.angle):
+        noise = smoothed_sigma(p.torque_constant * p.current_sigma, p.current_correlation_time)
+        friction_sigma, load_sigma = _standing_sigmas(s, p, m)
+        swings = hold(c, s.force, noise, gain, load, coulomb, friction_sigma, load_sigma, p.presliding_angle)
+        # A latch holds the motor against any torque, and the stop of an open brake against one that opens it.
+        if m.has_status and m.park_brake == 0.0 and (s.force > 0.0 or torque > 0.0):
+            spread = hypot(gain * out.stiffness_sigma, standing_sigma)
+            beyond = _least_beyond_friction(s, p, m, 0.0, spread) - BEYOND_CHANCE
+            if due(c, beyond * spread / p.inertia, s.late + effects.known_delay(p.effects), m.dt):
+                swings = max(swings, 1)
+    if np.isfinite(out.innovation):
+        spread = hypot(gain * out.stiffness_sigma, turning_sigma)
+        beyond = _least_beyond_friction(s, p, m, accelerating, spread)
+        count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
+    if swings > 1:
+        disbelieve_resolver(c)
+    return swings
+
+
+@njit
 def _facts_of_torque(s, p):
     """Facts of the torque path that change neither force nor sigma."""
     facts = 0
-    if s.torque_age >= _OLD_S:
+    if s.torque_age >= _OLD_S and not (s.unknown or s.plausibility.verdict == STIFFNESS_WRONG):
+        # Else the force is the torque's alone.
         facts |= TORQUE_OLD
-    if unproven(s) > _NOTED * p.maximum_force:
+    jump = max(unproven(s), abs(s.mean_beyond) if contradicts(s) else 0.0)
+    if s.contact.engaged:
+        jump = max(jump, s.stepping.apart)
+    if jump > _NOTED * p.maximum_force:
         facts |= JUMP_SUSPECTED
-    if abs(s.error[OFFSET]) > 2.0 * torque_offset(p):
+    if abs(s.error[OFFSET]) > _OFFSET_LARGE * torque_offset(p):
         facts |= OFFSET_LARGE
     if uneven.unproven(s.uneven) > _NOTED * p.maximum_force:
         facts |= DISC_UNEVEN
@@ -473,26 +567,7 @@ def take_sides(
     nothing."""
     c = s.plausibility
     force, sigma, torque, gain, load, coulomb = _torque_alone(s, p, m)
-    accelerating = p.inertia * (m.speed - s.speed) / m.dt if m.dt > 0.0 else 0.0
-    swings = 0
-    if m.has_current:
-        steady(c, _motor_torque(s, s.error), accelerating, m.dt)
-    if m.has_current and stands(c, m.angle):
-        noise = smoothed_sigma(p.torque_constant * p.current_sigma, p.current_correlation_time)
-        friction_sigma, load_sigma = _standing_sigmas(s, p, m)
-        swings = hold(c, s.force, noise, gain, load, coulomb, friction_sigma, load_sigma, p.presliding_angle)
-        # A latch holds the motor against any torque, and the stop of an open brake against one that opens it.
-        if m.has_status and m.park_brake == 0.0 and (s.force > 0.0 or torque > 0.0):
-            spread = hypot(gain * out.stiffness_sigma, standing_sigma)
-            beyond = _least_beyond_friction(s, p, m, 0.0, spread) - BEYOND_CHANCE
-            if due(c, beyond * spread / p.inertia, s.late + effects.known_delay(p.effects), m.dt):
-                swings = max(swings, 1)
-    if np.isfinite(out.innovation):
-        spread = hypot(gain * out.stiffness_sigma, turning_sigma)
-        beyond = _least_beyond_friction(s, p, m, accelerating, spread)
-        count_contradiction(c, max(beyond, abs(out.innovation) / out.innovation_sigma))
-    if swings > 1:
-        disbelieve_resolver(c)
+    swings = _count_against_resolver(s, p, m, turning_sigma, standing_sigma, torque, gain, load, coulomb, out)
     s.no_current_s = 0.0 if m.has_current else s.no_current_s + m.dt
     facts = _facts_of_torque(s, p)
     # A latched brake needs no current: the torque alone then says that nothing is known.

@@ -24,7 +24,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.paths import UNCERTAIN_CONTACT_RAD, still_to_gain
+from emb_daemon.estimator.paths import ONE_CYCLE_S, UNCERTAIN_CONTACT_RAD, still_to_gain
 from emb_daemon.estimator.unknown import (
     LEAST_SCALE,
     MOST_CREEP,
@@ -36,7 +36,7 @@ from emb_daemon.estimator.unknown import (
     add_torque_jumps,
     stay_possible,
 )
-from emb_daemon.jit import Floats, Record, njit, sq
+from emb_daemon.jit import Floats, Record, fields, njit, sq
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
@@ -105,6 +105,13 @@ _SURELY = 9.0
 #: slowly.
 GATE = 5.0
 
+#: Standard deviations of the mean of three innovations from which a torque has stepped: once in eight seconds by chance, which
+#: costs nothing, because without evidence the jumps are opened each second. Samples before it, and four standard deviations of
+#: their mean, over which the first hypothesis explained it. Time since the pads touch, until which a contact that has moved
+#: looks the same (the strokes of a brake take 0.1 to 0.25 s), and time in which it does not step again, s. Least speed of a
+#: motor that slides, rad/s: two standard deviations of the mean of three noisy ones.
+_STEPS, _BEFORE, _CONSISTENT, _BRAKED_S, _STEPPED_S, _SLIDING_RAD_PER_S = 3.5, 10.0, 1.0, 0.25, 0.1, 0.5
+
 #: What may have changed at once, or shows with heat and time, a jump that was opened before, and a brake that drifts, which
 #: never becomes the first hypothesis.
 ALTERNATIVES = 5
@@ -130,6 +137,21 @@ ALTERNATIVE = np.dtype(
         ("shift", "f8"),
         ("slope", "f8"),
         ("told", "f8"),
+    ],
+    align=True,
+)
+
+
+#: How well the first hypothesis explains the torque, in standard deviations of its innovation: of the ``last`` three samples,
+#: the newest first, and the mean ``before`` those. Log ``odds`` of a jump of the torque path before each of the three, and
+#: ``speed`` in the direction of friction, rad/s.
+#: ``braked_s`` since the pads touch, ``since_s`` since the last step. Whether a jump of the torque path was ``opened`` by one,
+#: and what force the current would need to be ``apart`` for that, N, by its probability.
+STEPPING = np.dtype(
+    [
+        *((name, "f8", (3,)) for name in ("last", "odds", "speed")),
+        *fields("f8", "before braked_s since_s apart"),
+        ("opened", "?"),
     ],
     align=True,
 )
@@ -181,6 +203,8 @@ def _open(s, p, kind):
         a.log_odds = -np.inf
     a.shift = a.age_s = a.told = 0.0
     a.kind = kind
+    if kind == TORQUE_JUMP:
+        s.stepping.opened = False
 
 
 @njit
@@ -439,6 +463,39 @@ def learn(
     if trusted and innovation * innovation < GATE * GATE * s:
         update_errors(x, P, gain, innovation, s)
     return innovation, s
+
+
+@njit
+def watch_steps(s: Record, p: Record, innovation: float, speed: float, dt: float) -> None:
+    """Open a jump of the torque path anew where the torque of a motor that slides has stepped while the pads touch;
+    ``innovation`` of the first hypothesis, in its standard deviations, ``speed`` of the motor, rad/s.
+
+    What jumps within a stroke is a sensor or what it measures. The hypotheses that were opened before the stroke have learned
+    in it: the torque's that no offset fits, the stiffness path's little as long as the force is low, so that it alone could
+    explain the step."""
+    w, torque = s.stepping, s.alternatives[TORQUE_JUMP]
+    # Over a gap neither acceleration nor friction are what they were at its end.
+    w.braked_s = w.braked_s + dt if s.contact.engaged and dt <= ONE_CYCLE_S else 0.0
+    w.before += (w.last[2] - w.before) / _BEFORE
+    for i in (2, 1):
+        w.last[i], w.odds[i], w.speed[i] = w.last[i - 1], w.odds[i - 1], w.speed[i - 1]
+    w.last[0], w.odds[0], w.speed[0] = innovation, torque.log_odds, speed * s.friction_mean
+    steps = abs(w.last[0] + w.last[1] + w.last[2]) > _STEPS * sqrt(3.0) and abs(w.before) < _CONSISTENT
+    # At a reversal it steps by as much as friction is another than expected.
+    steps = steps and w.speed[0] + w.speed[1] + w.speed[2] > 3.0 * _SLIDING_RAD_PER_S
+    w.since_s += dt
+    if steps and min(w.braked_s / _BRAKED_S, w.since_s / _STEPPED_S) > 1.0 and w.odds[2] < torque.prior + _KEPT:
+        _open(s, p, TORQUE_JUMP)
+        w.since_s, w.opened = 0.0, True
+
+
+@njit
+def weigh_step(s: Record, leverage: float) -> None:
+    """Set what a current that has stepped in a stroke would be apart: until the release shows that it was the current,
+    something may have given way that the motor presses against."""
+    w, a = s.stepping, s.alternatives[TORQUE_JUMP]
+    stepped = w.opened and s.contact.engaged and a.log_odds > PROVEN
+    w.apart = a.share * abs(a.error[OFFSET] - s.error[OFFSET]) / leverage if stepped else 0.0
 
 
 @njit

@@ -125,10 +125,15 @@ def _deform(s, p, x, dt, factor):
 
 
 @njit
-def doubt_memory(s: Record, p: Record, chance: float, rested_s: float) -> None:
-    """What the pads remember is unknown: with that ``chance`` a stop, as strong as an ordinary one or less, ended ``rested_s``
-    s ago. With effects of slow relaxation that is force which neither angle nor torque of a released brake shows."""
-    held = sqrt(chance) * _ORDINARY * p.maximum_force
+def ordinary_stop(p: Record, chance: float) -> float:
+    """Force (N) whose square is the mean square of that of an ordinary stop, if there was one with that ``chance``."""
+    return sqrt(chance) * _ORDINARY * p.maximum_force
+
+
+@njit
+def doubt_memory(s: Record, p: Record, held: float, rested_s: float) -> None:
+    """What the pads remember is unknown: a stop of ``held`` N or less ended ``rested_s`` s ago. With effects of slow
+    relaxation that is force which neither angle nor torque of a released brake shows."""
     travel = travel_at(held, p.curve)
     if np.isfinite(travel):
         effects.static_force(p.effects, s.held_effects, held, travel, _LONG_S)
@@ -273,6 +278,33 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
     Returns (torque left to the clamp force in N m, its leverage gamma + mu s in m/rad, variance of the friction state);
     the torque is NaN where it says nothing.
     """
+    mean = s.friction_mean = _friction_over_cycle(s, p, m)
+    read = m.angle + s.ahead
+    # Teeth and poles stay where they are when the resolver's zero moves.
+    angle = read - s.zero_moved
+    e, state, mean_speed, travel = p.effects, s.effects, 0.5 * (m.speed + s.speed), s.travel
+    s.gear_gain = effects.gear_gain(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    s.gear_friction = effects.gear_friction(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
+    s.motor_torque = p.torque_constant * m.current_q
+    # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
+    middle, slope = turned(s, p, read - 0.5 * travel)
+    s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
+    leverage = (p.gear_gain * s.gear_gain + p.load_friction * s.gear_friction * mean) * slope
+    if not m.has_current or m.dt <= 0.0 or leverage < SELF_LOCKING * p.gear_gain * slope:
+        return np.nan, leverage, 1.0
+    s.motor_torque = effects.motor_torque(
+        e, state, m, p.torque_constant, angle, travel, mean_speed, s.disc, s.temperature_known
+    )
+    offset_friction = p.offset_friction * s.gear_friction
+    torque = unexplained_torque(s.motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
+    turning = p.presliding_sigma * (1.0 - mean * mean)
+    torque -= leverage * s.spring_force
+    return torque, leverage, s.friction_variance + turning * turning
+
+
+@njit
+def _friction_over_cycle(s, p, m):
+    """Mean of the friction state over the cycle that ends at this sample; follows the state and its variance."""
     # Friction turns over with the motor, not with an angle that is late; the noise of its speed at rest is no motion. A stop
     # that is abrupt passes for an age of up to half a cycle (1.8 ms from 140 rad/s): the speed beside it is a mean around it.
     known = effects.known_delay(p.effects)
@@ -307,25 +339,4 @@ def torque_path(s: Record, p: Record, m: Record) -> tuple[float, float, float]:
         s.friction_variance = max(s.friction_variance, sq(mean - other))
     if age > 0.0:
         mean = friction_since(s.lately, s.friction_state, mean, age, _CERTAINLY * p.speed_sigma, p.presliding_angle)
-    s.friction_mean = mean
-    read = m.angle + s.ahead
-    # Teeth and poles stay where they are when the resolver's zero moves.
-    angle = read - s.zero_moved
-    e, state, mean_speed, travel = p.effects, s.effects, 0.5 * (m.speed + s.speed), s.travel
-    s.gear_gain = effects.gear_gain(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
-    s.gear_friction = effects.gear_friction(e, state, angle, travel, mean_speed, mean, s.past_contact, s.force, m.dt)
-    s.motor_torque = p.torque_constant * m.current_q
-    # What the motor gives to the gear comes out as work: friction is that of the load that the reduction sees.
-    middle, slope = turned(s, p, read - 0.5 * travel)
-    s.spring_force = p.spring * p.gear_gain * max(middle - s.gear_zero, 0.0)
-    leverage = (p.gear_gain * s.gear_gain + p.load_friction * s.gear_friction * mean) * slope
-    if not m.has_current or m.dt <= 0.0 or leverage < SELF_LOCKING * p.gear_gain * slope:
-        return np.nan, leverage, 1.0
-    s.motor_torque = effects.motor_torque(
-        e, state, m, p.torque_constant, angle, travel, mean_speed, s.disc, s.temperature_known
-    )
-    offset_friction = p.offset_friction * s.gear_friction
-    torque = unexplained_torque(s.motor_torque, p.inertia, m.speed - s.speed, m.dt, offset_friction, mean)
-    turning = p.presliding_sigma * (1.0 - mean * mean)
-    torque -= leverage * s.spring_force
-    return torque, leverage, s.friction_variance + turning * turning
+    return mean

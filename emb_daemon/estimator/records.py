@@ -5,8 +5,9 @@ import numpy as np
 from emb_daemon.effects import REGISTRY, parameter_record, state_record
 from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.force_sensor import FORCE_SENSOR, FORCE_SENSOR_PARAMETERS
-from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES
+from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES, STEPPING
 from emb_daemon.estimator.monitor import MONITOR
+from emb_daemon.estimator.phases import OPEN_PHASES
 from emb_daemon.estimator.resolver import AWAY
 from emb_daemon.estimator.rewind import LEARNED, STOPS
 from emb_daemon.estimator.straying import STRAYING
@@ -150,6 +151,10 @@ STATE = np.dtype(
         ("error", "f8", (STATES,)),
         ("covariance", "f8", (STATES, STATES)),
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
+        ("stepping", STEPPING),
+        # What the torque says beyond the first hypothesis, N, not a number where it says nothing, and its variance but for
+        # noise that a mean has not, N2; beyond the fused force, of late, and the variance of that.
+        *fields("f8", "beyond beyond_variance mean_beyond beyond_square"),
         # What was known after each of the last stops, the oldest first.
         ("learned", LEARNED, (STOPS,)),
         # How often the estimator has gone back to them.
@@ -182,6 +187,7 @@ STATE = np.dtype(
         ("consistency", CONSISTENCY),
         ("straying", STRAYING),
         ("uneven", UNEVEN),
+        ("phases", OPEN_PHASES),
         ("sensor", FORCE_SENSOR),
         ("monitor", MONITOR),
         ("wheel", WHEEL),

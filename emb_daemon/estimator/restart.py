@@ -8,7 +8,7 @@ from math import exp
 
 import numpy as np
 
-from emb_daemon.estimator.paths import AFTER_A_RESTART, doubt_memory
+from emb_daemon.estimator.paths import AFTER_A_RESTART, doubt_memory, ordinary_stop
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
@@ -156,7 +156,7 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     s.covariance[FAST, FAST] = 1.0
     s.covariance[NOISE, NOISE] = sq(p.torque_constant * p.current_sigma)
     add_rest(s.covariance, p, elapsed_s)
-    doubt_memory(s, p, AFTER_A_RESTART, max(elapsed_s - SNAPSHOT_S, 0.0))
+    doubt_memory(s, p, ordinary_stop(p, AFTER_A_RESTART), max(elapsed_s - SNAPSHOT_S, 0.0))
     s.alignment.delay, s.alignment.lag, s.lateness.filtered = snapshot.delay, snapshot.lag, snapshot.filtered
     s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
     s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)

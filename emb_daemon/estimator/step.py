@@ -16,7 +16,15 @@ from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.heat import heat, tell
 from emb_daemon.estimator.hypotheses import open_all
 from emb_daemon.estimator.monitor import bound, contradicts
-from emb_daemon.estimator.paths import AT_A_START, ONE_CYCLE_S, doubt_friction, doubt_memory, stiffness_path, torque_path
+from emb_daemon.estimator.paths import (
+    AT_A_START,
+    ONE_CYCLE_S,
+    doubt_friction,
+    doubt_memory,
+    ordinary_stop,
+    stiffness_path,
+    torque_path,
+)
 from emb_daemon.estimator.resolver import (
     LONG_AGO_S,
     MOST_SLIP_RAD,
@@ -105,7 +113,7 @@ def _start(s, p, m):
             for i in CREEPS:
                 s.covariance[i, i] = 0.0
         else:
-            doubt_memory(s, p, AT_A_START, 0.0)
+            doubt_memory(s, p, ordinary_stop(p, AT_A_START), 0.0)
     s.gear_zero = m.angle
     # Of a motor that turns at the first sample the released position is unknown.
     s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf
@@ -159,7 +167,10 @@ def _advance(s, p, m, angle, speed, out):
     if not s.started:
         _start(s, p, m)
     believe_speed(s, p, m)
+    if p.clearance_sigma > 0.0:
+        effects.doubt_phase(p.effects, s.effects, m)
     turned = way_beside(s.lately, m.angle - s.angle, m.speed, s.speed, effects.known_delay(p.effects), m.dt)
+    was_wrong = s.plausibility.verdict == STIFFNESS_WRONG
     moved_zero = follow_zero(s, p, m, turned)
     if 0.0 < m.dt <= ONE_CYCLE_S and not moved_zero:
         sigma = sqrt(s.covariance[CONTACT, CONTACT])
@@ -173,18 +184,14 @@ def _advance(s, p, m, angle, speed, out):
     if s.drifting_s > 0.0:
         disbelieve_resolver(s.plausibility)
     knew = s.temperature_known
+    if was_wrong and s.plausibility.verdict != STIFFNESS_WRONG:
+        # What the pads have been through meanwhile the angle has not shown.
+        doubt_memory(s, p, max(ordinary_stop(p, 1.0), s.fused), 0.0)
     if p.clearance_sigma > 0.0:
         seek_release(s, p, m)
     heat(s, p, m)
     if s.temperature_known and not knew and not s.resumed:
-        s.growth_start = s.disc
-        set_friction(s.covariance, p, m.caliper)
-        if p.clearance_sigma > 0.0:
-            rise = 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference
-            add_softening(s.covariance, p, rise, s.temperature_sigma)
-            s.softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
-        open_all(s, p)
-        keep_all(s)
+        _begin_warm(s, p, m)
     _follow_noise(s, p, m)
     force_before = s.force
     stiffness_path(s, p, m, s.factor * s.scale)
@@ -196,14 +203,7 @@ def _advance(s, p, m, angle, speed, out):
     if m.dt <= ONE_CYCLE_S and not frozen(s.plausibility) and not s.unknown and aligned(s.alignment) and not doubtful:
         watch_contact(s, p, m, force_before, torque, leverage)
     turning_sigma, standing_sigma = fuse(s, p, m, force_before, torque, leverage, friction_variance, out)
-    out.stiffness_force = s.force
-    # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
-    out.torque_force, out.ml_force = np.nan, s.force
-    if np.isfinite(torque):
-        paired = np.isfinite(s.balance)
-        force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
-        out.torque_force = max(force, 0.0)
-        out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
+    _tell_paths(s, torque, leverage, out)
     facts = take_sides(s, p, m, turning_sigma, standing_sigma, friction_variance if np.isfinite(torque) else 1.0, out)
     by_torque = facts & (RESOLVER_IMPLAUSIBLE | CONTACT_UNKNOWN | CONTACT_SOUGHT) != 0
     if (s.alignment.delay != 0.0 or s.alignment.lag < 0.0) and not by_torque:
@@ -222,6 +222,32 @@ def _advance(s, p, m, angle, speed, out):
     out.mode = RUNNING
     tell_status(_look(s, p, m, facts, out) | (ZERO_MOVED if moved_zero else 0), out)
     s.fused, s.fused_sigma = out.force, out.sigma
+
+
+@njit
+def _begin_warm(s, p, m):
+    """Once temperatures are known for the first time: what heat has done to the brake before power-on."""
+    s.growth_start = s.disc
+    set_friction(s.covariance, p, m.caliper)
+    if p.clearance_sigma > 0.0:
+        rise = 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference
+        add_softening(s.covariance, p, rise, s.temperature_sigma)
+        s.softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
+    open_all(s, p)
+    keep_all(s)
+
+
+@njit
+def _tell_paths(s, torque, leverage, out):
+    """The force by each path, and by both without a filter."""
+    out.stiffness_force = s.force
+    # Two cycles: over one, the noise of both speeds counts in full; over more, the mean lags.
+    out.torque_force, out.ml_force = np.nan, s.force
+    if np.isfinite(torque):
+        paired = np.isfinite(s.balance)
+        force = torque_balance(torque + s.balance, leverage + s.leverage) if paired else torque_balance(torque, leverage)
+        out.torque_force = max(force, 0.0)
+        out.ml_force, _ = maximum_likelihood(s.force, out.stiffness_sigma, out.torque_force, out.torque_sigma)
 
 
 @njit

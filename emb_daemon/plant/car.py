@@ -43,6 +43,8 @@ _SLOW_NS, _STATUS_NS, _REFERENCE_SLOW_NS = 10_000_000, 100_000_000, 100_000_000
 _AFTER_NS, _REFERENCE_AFTER_NS = 900_000, 400_000
 #: Frames leave up to this late after their sample, s.
 _JITTER_S = 150e-6
+#: What a wheel turns by in the range of its counter, and while that counts one, rad.
+COUNTER_RAD, COUNT_RAD = PULSE_MODULO / PULSES_PER_TURN * 2.0 * pi, 2.0 * pi / PULSES_PER_TURN
 #: Frames that one cycle can hold with four corners and reference instruments.
 FRAMES_PER_TICK = 32
 
@@ -369,6 +371,7 @@ class Car:
         reference: send the rig instruments' RIG_* frames too.
         start_ns: time of the first sample, less one cycle.
         ambient: degC; everything starts at this temperature.
+        wheels_rad: that the wheels have turned by at most since their counters began, which they do at power-on.
 
     Attributes:
         truth: TRUTH array, one row per corner, of the last tick.
@@ -383,6 +386,7 @@ class Car:
         reference: bool = False,
         start_ns: int = 0,
         ambient: float = 22.0,
+        wheels_rad: float = COUNT_RAD,
     ):
         if len(plants) != len(corners):
             raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
@@ -399,7 +403,7 @@ class Car:
         motion["drag"], motion["rolling"] = 0.1 * len(corners), 50.0 * len(corners)
         motion["acceleration"], motion["supply_voltage"] = 4.0, 13.5
         motion["time_ns"], motion["reference"] = start_ns, reference
-        self.states["wheel_angle"] = rng.uniform(0.0, PULSE_MODULO / PULSES_PER_TURN * 2.0 * pi, len(plants))
+        self.states["wheel_angle"] = rng.uniform(0.0, wheels_rad, len(plants))
         fast = wire.CORNER_MESSAGES * np.arange(4)
         drawn = np.setdiff1d(np.arange(wire.SLOTS), fast + wire.FORCE_SENSOR)
         motion["counter"][drawn] = rng.integers(0, COUNTER_MODULO, len(drawn))

@@ -159,7 +159,7 @@ def simulate_log(
     seed: int = 0,
     corners: tuple[str, ...] = ("FL",),
     reference: bool = True,
-    **car_options: bool,
+    **car_options: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A whole log at once, reproducible from its seed.
 
