@@ -61,7 +61,7 @@ class Recording:
     def __enter__(self) -> Self:
         self._output = self.path.open("w")
         self._process = subprocess.Popen(self._command, stdout=self._output)
-        wait_for("candump listens", self._listens, timeout_s=10)
+        wait_for("candump listens", self._listens, timeout_s=60)
         return self
 
     def _listens(self) -> bool:
@@ -75,7 +75,7 @@ class Recording:
 
     def __exit__(self, *_: object) -> None:
         self._process.send_signal(signal.SIGINT)
-        self._process.wait(10)
+        self._process.wait(60)
         self._output.close()
         self.frames = read_log(self.path)
 
@@ -94,7 +94,7 @@ def playing(log: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
         yield process
     finally:
         process.kill()
-        process.wait(10)
+        process.wait(60)
 
 
 def answers(frames: list[Frame]) -> list[bytes]:

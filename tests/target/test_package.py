@@ -130,7 +130,7 @@ def test_install_configure_run_upgrade_remove_purge(
     systemctl("stop", _UDS)
 
     with playing(rig_log, "-l", "i"):
-        wait_for_forces(record, timeout_s=30)
+        wait_for_forces(record, timeout_s=READY_S)
         # What was accepted before, and what driving told the filter.
         Memory(STATE).save(learned("FR"))
         accepted = (STATE / "adaptation-FR.json").read_bytes()
@@ -139,7 +139,7 @@ def test_install_configure_run_upgrade_remove_purge(
         wait_for("the later version is ready", active, READY_S)
         print(f"upgraded in {took:.1f} s")
         assert main_pid() != pid
-        wait_for_forces(record, timeout_s=30)
+        wait_for_forces(record, timeout_s=READY_S)
     said = journal_since(cursor)
     assert "corner FR: learned values of 2026-01-02T03:04:05+00:00 in use" in said and "not used" not in said
     assert (STATE / "adaptation-FR.json").read_bytes() == accepted and CLEARANCE in command("adaptation", "show")
