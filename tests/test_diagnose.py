@@ -123,6 +123,7 @@ def _shows_the_disc(result, um):
     assert np.hypot(found["order_1_cosine_um"], found["order_1_sine_um"]) == pytest.approx(um, rel=0.1)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("wheels_rad", _STARTS)
 def test_a_few_long_drags_show_an_uneven_disc(calibration, wheels_rad):
     """Three episodes, but a hundred turns of the disc in each; `diagnose` itself asks for such drags."""

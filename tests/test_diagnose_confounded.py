@@ -36,8 +36,8 @@ def two(monkeypatch):
     ("hidden", "sure"),
     [
         ({"friction_asymmetry": {"asymmetry": 0.1}}, False),
-        ({"friction_asymmetry": {"asymmetry": -0.2}}, False),
-        ({"current_offset": {"offset_A": 0.07}}, False),
+        pytest.param({"friction_asymmetry": {"asymmetry": -0.2}}, False, marks=pytest.mark.trial),
+        pytest.param({"current_offset": {"offset_A": 0.07}}, False, marks=pytest.mark.trial),
         ({"current_offset": {"offset_A": -0.07}}, False),
         ({"current_offset": {"offset_A": -0.47}}, True),
     ],

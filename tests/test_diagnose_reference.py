@@ -31,14 +31,14 @@ def _with_late_reference(log, samples):
     return dataclasses.replace(log, force_N=force)
 
 
-@pytest.mark.parametrize("samples", [0, 1, 3])
+@pytest.mark.parametrize("samples", [pytest.param(0, marks=pytest.mark.trial), pytest.param(1, marks=pytest.mark.trial), 3])
 def test_a_late_reference_is_told_whatever_the_friction(calibration, brake_log, samples):
     """A viscous friction alone makes the force 10 ms late beside the current, and not beside the angle."""
     late_s = reference_late_s(Bench([_with_late_reference(brake_log, samples)], calibration))
     assert late_s == pytest.approx(0.004 * samples + _ITS_OWN_S, abs=4e-4)
 
 
-@pytest.mark.parametrize("late_s", [0.004, 0.001, -0.004])
+@pytest.mark.parametrize("late_s", [0.004, *(pytest.param(late, marks=pytest.mark.trial) for late in (0.001, -0.004))])
 def test_an_angle_of_another_time_is_no_such_reference(calibration, brake_log, late_s):
     """It is late or early beside the current as well."""
     rows, time = brake_log.samples.copy(), brake_log.time_s

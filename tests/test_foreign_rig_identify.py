@@ -71,8 +71,14 @@ def _judge(folder, most_N: float, angle=None, first: int = 1) -> None:
     [
         ({"curve": foreignkit.slow, "random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
         ({"random": foreignkit.random}, "thermal: no log heats the pads", 30.0, 0),
-        ({"curve": foreignkit.slow}, "random: no usable log, so that the fast relaxation keeps what is usual", 400.0, 3),
-        ({"curve": _clamp_only}, "random: no usable log", 500.0, 3),
+        pytest.param(
+            {"curve": foreignkit.slow},
+            "random: no usable log, so that the fast relaxation keeps what is usual",
+            400.0,
+            3,
+            marks=pytest.mark.trial,
+        ),
+        pytest.param({"curve": _clamp_only}, "random: no usable log", 500.0, 3, marks=pytest.mark.trial),
         pytest.param({"curve": _long}, "random: no usable log", 400.0, 3, marks=pytest.mark.trial),
         pytest.param({"curve": _low}, "curves: no log clamps harder than 2.15 of 20 kN", 400.0, 3, marks=pytest.mark.trial),
         ({"curve": _in_contact}, "contact: every log begins in contact, and the clearance is the datasheet's", 500.0, 3),
@@ -142,6 +148,7 @@ def _dome(tmp_path, *names: str) -> None:
     _map_angle_and_force_alone(tmp_path)
 
 
+@pytest.mark.trial
 def test_a_curve_that_predicts_worse_than_a_plain_cubic_is_reported(tmp_path, capsys):
     """Each of two logs is predicted from the other; the force of a dome is predicted much worse than by a cubic."""
     campaign = foreignkit.write_campaign(tmp_path, curve_1=_low(), curve_2=_low())

@@ -264,7 +264,10 @@ def test_logs_that_judge_are_judged_by_what_is_fitted():
     assert diagnose([fit], stated, [judge]).judges.load_follows
 
 
-@pytest.mark.parametrize(("load", "validated"), [(1.0, True), (1.0, False), (0.1, True)])
+@pytest.mark.parametrize(
+    ("load", "validated"),
+    [pytest.param(1.0, True, marks=pytest.mark.trial), pytest.param(1.0, False, marks=pytest.mark.trial), (0.1, True)],
+)
 def test_what_a_plain_fit_leaves_is_stated_beside_what_was_found(load, validated):
     """Where friction scatters and nothing else is there to be found, both leave the same."""
     stated, _, fit, judge = _on_a_dynamometer(scatter=0.9, load=load)
@@ -319,6 +322,7 @@ def test_what_a_free_motor_draws_is_not_explained_by_itself(validated):
     assert "a load that is measured" in found.selection.candidates["torque_saturation"].reason
 
 
+@pytest.mark.trial
 def test_the_friction_of_a_joint_is_found_though_no_brake_has_as_much(tmp_path):
     """At its own shaft a robot's joint has a thousand times the viscous friction of a brake's motor: its own current and speed
     say how much may be. What is found is a calibration like any other, but not of a brake."""
@@ -499,7 +503,12 @@ def test_a_motor_that_turns_on_and_on_is_followed(capsys):
         # In proportion to the current and not to its square, as no effect of the catalogue has it.
         (lambda current, speed, made: 0.15 * made * np.abs(current) / 13.0, "torque_constant:current", r"K_m × \(1 − 0\.1"),
         # Air that a rotor drags along. A torque and a friction over the speed are one where a motor turns one way.
-        (lambda current, speed, made: 0.08 * (speed / 190.0) ** 2, "torque:motor_speed", r"T_m − 0\.0[78]\d* N·m"),
+        pytest.param(
+            lambda current, speed, made: 0.08 * (speed / 190.0) ** 2,
+            "torque:motor_speed",
+            r"T_m − 0\.0[78]\d* N·m",
+            marks=pytest.mark.trial,
+        ),
     ],
 )
 def test_a_term_is_made_for_a_motor_that_turns_on_and_on(lost, term, equation):

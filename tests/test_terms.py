@@ -458,6 +458,7 @@ _EXPORTED = (
 )  # fmt: skip
 
 
+@pytest.mark.trial
 def test_an_exported_effect_is_the_term(calibration, tmp_path):
     """By the command, in the form of a file of one's own: the estimator with it gives what it gives with the term."""
     plain, files, termed = msgspec.structs.replace(calibration, provenance=None), [], []
