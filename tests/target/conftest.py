@@ -10,20 +10,17 @@ import gzip
 import itertools
 import os
 import shutil
-import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
 from bus_tools import CHANNEL, RIG, Recording
-from machine import Watch
-from service_tools import BEFORE_ANOTHER
+from machine import Watch, tried_again
 
 # What .ci/target promises. A test that finds a promise broken fails; it is never skipped for that.
 PROMISED = {"native": {"can"}, "uml": {"can"}, "systemd": {"can", "systemd"}, "package": {"can", "package"}}
 
 WATCH = pytest.StashKey[Watch | None]()
-HELD_UP = 0.05
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -59,20 +56,8 @@ def watched(request: pytest.FixtureRequest, machine: Watch | None) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     """A test that fails while the machine keeps its CPU from the guest has judged the machine: it is tried again, and .ci/run
-    says so. What the daemon itself takes is not counted."""
-    watch = item.stash.get(WATCH, None)
-    begun_s, lost_s = time.monotonic(), watch.lost_s() if watch else 0.0
-    try:
-        return (yield)
-    except (Exception, pytest.fail.Exception) as error:
-        share = (watch.lost_s() - lost_s) / (time.monotonic() - begun_s) if watch else 0.0
-        print(f"an empty real-time process lost {share:.1%} of the time")
-        if share < HELD_UP:
-            raise
-        said = str(error).partition("\n")[0]
-    item.warn(pytest.PytestWarning(f"HELD UP for {share:.0%} of the time, tried again: {item.name}: {said}"))
-    item.stash.get(BEFORE_ANOTHER, lambda: None)()
-    return item.runtest()
+    says so."""
+    return (yield from tried_again(item, item.stash.get(WATCH, None)))
 
 
 @pytest.fixture

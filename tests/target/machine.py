@@ -7,12 +7,19 @@ import os
 import signal
 import struct
 import time
+from collections.abc import Callable, Generator
+
+import pytest
 
 # Before the daemon (60) and the players (70): what it loses, they do not take.
 PRIORITY = 80
 PERIOD_S = 0.02
-# A guest's own delays stay below: 6 ms in 99 of 100 wakes on a quiet machine.
+# Five of the daemon's periods, so that what the guest's kernel does in between is none.
 LATE_S = 0.02
+# Share of the time. In a run in which the machine took a fifth the watchdog ended the daemon, and 17 % were lost.
+HELD_UP = 0.05
+# Makes a test that is tried again find what it found the first time.
+BEFORE_ANOTHER = pytest.StashKey[Callable[[], None]]()
 
 
 class Watch:
@@ -47,3 +54,19 @@ def _watch(lost: mmap.mmap) -> None:
         if late_s > LATE_S:
             total_s += late_s
             lost[:] = struct.pack("d", total_s)
+
+
+def tried_again(item: pytest.Item, watch: Watch | None) -> Generator[None, object, object]:
+    """What is left of a `pytest_runtest_call`: a test that fails is run once more if the machine was held up meanwhile."""
+    begun_s, lost_s = time.monotonic(), watch.lost_s() if watch else 0.0
+    try:
+        return (yield)
+    except (Exception, pytest.fail.Exception) as error:
+        share = (watch.lost_s() - lost_s) / (time.monotonic() - begun_s) if watch else 0.0
+        print(f"an empty real-time process lost {share:.1%} of the time")
+        if share < HELD_UP:
+            raise
+        said = str(error).partition("\n")[0]
+    item.warn(pytest.PytestWarning(f"HELD UP for {share:.0%} of the time, tried again: {item.name}: {said}"))
+    item.stash.get(BEFORE_ANOTHER, lambda: None)()
+    return item.runtest()

@@ -7,14 +7,11 @@ import subprocess
 import time
 from collections.abc import Callable
 
-import pytest
 from bus_tools import Recording, wait_for
 
 UNIT = "emb-daemon.service"
 FORCES = ",200:7FC"  # EMB_c_ClampForce of all corners
 PERIOD_S = 0.004
-# What a test that is tried again finds as it did the first time.
-BEFORE_ANOTHER = pytest.StashKey[Callable[[], None]]()
 
 
 def systemctl(*arguments: str, check: bool = True) -> str:

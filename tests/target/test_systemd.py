@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 from bus_tools import CHANNEL, CLAMP_FORCE, RESOLVER, RIG, Recording, answers, differ, playing, replayed, wait_for
+from machine import BEFORE_ANOTHER
 from service_tools import (
-    BEFORE_ANOTHER,
     FORCES,
     PERIOD_S,
     UNIT,

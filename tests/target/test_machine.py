@@ -1,0 +1,75 @@
+"""A guest's test is tried again where the machine was held up, and nowhere else."""
+
+from __future__ import annotations
+
+import os
+import time
+from types import SimpleNamespace
+
+import pytest
+from machine import Watch, tried_again
+
+
+class _Item(SimpleNamespace):
+    """Of a test as pytest has it, what is asked for."""
+
+    def __init__(self) -> None:
+        super().__init__(name="test", stash=pytest.Stash(), said=[], runs=0)
+
+    def warn(self, warning: Warning) -> None:
+        self.said.append(str(warning))
+
+    def runtest(self) -> None:
+        self.runs += 1
+
+
+def _fail(item: _Item, share: float | None) -> None:
+    """The item fails after 50 ms, of which this share was lost; None: where nothing watches."""
+    lost_s = iter((1.0, 1.0 + 0.05 * (share or 0.0)))
+    running = tried_again(item, None if share is None else SimpleNamespace(lost_s=lambda: next(lost_s)))
+    next(running)
+    time.sleep(0.05)
+    with pytest.raises(StopIteration):
+        running.throw(AssertionError("too late"))
+
+
+@pytest.mark.parametrize("share", [None, 0.0, 0.03])
+def test_what_fails_on_a_machine_that_was_there_has_failed(share: float | None) -> None:
+    item = _Item()
+    with pytest.raises(AssertionError, match="too late"):
+        _fail(item, share)
+    assert item.runs == 0 and not item.said
+
+
+def test_what_fails_while_the_machine_was_held_up_is_tried_once_more_and_said() -> None:
+    item = _Item()
+    _fail(item, 0.9)
+    assert item.runs == 1
+    [said] = item.said
+    assert said.startswith("HELD UP") and "too late" in said
+
+
+@pytest.mark.target("can")
+@pytest.mark.parametrize(("priority", "counts"), [(60, False), (99, True)])
+def test_what_the_daemon_takes_is_no_machine_that_was_held_up(priority: int, counts: bool) -> None:
+    """A process of the daemon's priority that takes the only CPU, and one that goes before the one that watches."""
+    anywhere = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(anywhere)})
+    watch = Watch()
+    try:
+        time.sleep(0.2)
+        before_s = watch.lost_s()
+        if not (child := os.fork()):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+            end_s = time.monotonic() + 0.5
+            while time.monotonic() < end_s:
+                pass
+            os._exit(0)
+        os.waitpid(child, 0)
+        time.sleep(0.2)
+        lost_s = watch.lost_s() - before_s
+    finally:
+        watch.close()
+        os.sched_setaffinity(0, anywhere)
+    print(f"{lost_s:.3f} s of 0.5 s lost")
+    assert lost_s > 0.25 if counts else lost_s < 0.1
