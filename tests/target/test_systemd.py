@@ -49,7 +49,7 @@ STATUS_WITHIN_S = 0.3  # it comes every 0.1 s
 PAIRING_S = 0.002
 
 COLD_START_S = 780  # all kernels compiled: 290 to 410 s seen, by what other guests left of the CPU
-WARM_START_S = 120  # 12 to 17 s seen, and 40 where other programs took the CPU
+WARM_START_S = 120  # 12 to 17 s seen, and 20 to 51 where other programs took the CPU
 MAXIMAL_EXPOSURE = 1.1
 
 
