@@ -6,6 +6,7 @@ import os
 import time
 from types import SimpleNamespace
 
+import machine
 import pytest
 from machine import Watch, tried_again
 
@@ -25,7 +26,7 @@ class _Item(SimpleNamespace):
 
 def _fail(item: _Item, share: float | None) -> None:
     """The item fails after 50 ms, of which this share was lost; None: where nothing watches."""
-    lost_s = iter((1.0, 1.0 + 0.05 * (share or 0.0)))
+    lost_s = iter((1.0, 1.0 + 0.05 * (share or 0.0), 2.0, 2.0))
     running = tried_again(item, None if share is None else SimpleNamespace(lost_s=lambda: next(lost_s)))
     next(running)
     time.sleep(0.05)
@@ -41,12 +42,25 @@ def test_what_fails_on_a_machine_that_was_there_has_failed(share: float | None) 
     assert item.runs == 0 and not item.said
 
 
-def test_what_fails_while_the_machine_was_held_up_is_tried_once_more_and_said() -> None:
+def test_what_fails_while_the_machine_was_held_up_is_tried_once_more_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
     item = _Item()
+    monkeypatch.setattr(machine, "CALM_S", 0.01)
     _fail(item, 0.9)
     assert item.runs == 1
     [said] = item.said
     assert said.startswith("HELD UP") and "too late" in said
+
+
+def test_it_is_tried_once_the_machine_is_there_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    item, asleep = _Item(), []
+    monkeypatch.setattr(machine, "CALM_S", 0.01)
+    monkeypatch.setattr("machine.time.sleep", asleep.append)
+    lost_s = iter((1.0, 2.0, 2.0, 2.1, 2.1, 2.1))
+    running = tried_again(item, SimpleNamespace(lost_s=lambda: next(lost_s)))
+    next(running)
+    with pytest.raises(StopIteration):
+        running.throw(AssertionError("too late"))
+    assert asleep == [0.01, 0.01] and item.runs == 1
 
 
 @pytest.mark.target("can")
