@@ -10,7 +10,7 @@ from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import CURRENT_APART
 from emb_daemon.estimator.step import _lead
 from emb_daemon.models import alignment
-from emb_daemon.models.alignment import ALIGNMENT, align, aligned, compare, interrupt
+from emb_daemon.models.alignment import ALIGNMENT, align, aligned, compare, in_step, interrupt
 from emb_daemon.offline import estimate
 from emb_daemon.wire.contract import OUTSIDE_RANGE
 
@@ -151,6 +151,16 @@ def test_until_changes_were_seen_to_belong_together_a_torque_that_changed_waits(
     assert aligned(a)
     a["delay_left"] = 1.0
     assert not aligned(a)
+
+
+@pytest.mark.parametrize(("pair", "expected"), [(lambda t: (_late(t, 1 / 3), t), True), (lambda t: (t, _late(t, 1 / 3)), True),
+    (lambda t: (brake.filtered(t, 5.0), t), False), (lambda t: (_late(t, 2.0), t), False)])  # fmt: skip
+def test_part_of_a_cycle_is_in_step_once_enough_was_compared(pair, expected):
+    """Of a filter and of whole cycles is nothing learned that a delay of part of a cycle explains as well."""
+    a, torque = np.zeros(1, ALIGNMENT)[0], _torque()
+    assert not in_step(a)
+    _compare(*pair(torque), a)
+    assert a["informative"] > 15.0 and in_step(a) == expected
 
 
 def test_samples_of_before_a_gap_are_not_compared():

@@ -19,6 +19,7 @@ from emb_daemon.models.fusion import (
     FAST,
     GAIN,
     GROWTH,
+    LATE,
     LOAD,
     NOISE,
     OFFSET,
@@ -63,14 +64,14 @@ def test_steady_state_solves_the_riccati_equation():
 _NEW = new_state()[0]
 
 
-def _sensitivities(p, force, slope, speed, accelerating, motor_torque, friction_mean, warmth, heats):
+def _sensitivities(p, force, slope, speed, accelerating, motor_torque, friction_mean, warmth, heats, changed=0.0):
     """Sensitivity of force and of the torque left unexplained, as `fuse` forms them."""
     to_f, to_t = np.zeros(STATES), np.zeros(STATES)
     leverage = p["gear_gain"] + p["load_friction"] * friction_mean
     to_force(to_f, _NEW, p["stiffness_sigma"] + p["stiffness_relative_sigma"] * force, slope, force, warmth)
     to_t[:] = to_f
     slow = friction_mean * np.exp(-abs(speed) / 10.0)
-    to_torque(to_t, leverage, 1.0, friction_mean, force, speed, slow, accelerating, motor_torque, *heats)
+    to_torque(to_t, leverage, 1.0, friction_mean, force, speed, slow, accelerating, motor_torque, changed, *heats)
     return to_f, to_t
 
 
@@ -86,7 +87,16 @@ def test_covariance_stays_symmetric_and_positive_over_long_random_input(paramete
         force = rng.uniform(0.0, 3e4)
         heats = rng.uniform(0.0, 1.0, 2)
         _, h = _sensitivities(
-            p, force, rng.uniform(0, 2e3), rng.uniform(-2e2, 2e2), rng.normal(), 4e-5 * force, rng.uniform(-1, 1), 0.0, heats
+            p,
+            force,
+            rng.uniform(0, 2e3),
+            rng.uniform(-2e2, 2e2),
+            rng.normal(),
+            4e-5 * force,
+            rng.uniform(-1, 1),
+            0.0,
+            heats,
+            0.1,
         )
         s = _update(x, P, gain, rng.normal(0.0, 0.1), h, 10.0 ** rng.uniform(-6, -2))
         assert s > 0.0
@@ -125,6 +135,7 @@ def test_filter_is_consistent_on_data_of_its_own_model(parameters):
                 np.tanh(speed / 5.0),
                 0.2 * step,
                 (step / 1e3, step / 4e3),
+                0.1 * np.cos(phase),
             )
             to_f, h = _sensitivities(p, *arguments)
             set_walks(walked, p, np.zeros(STATES), P, step / 1e3, step / 4e3, 0.0, 2e4, 0.0, 0.004)
@@ -159,6 +170,7 @@ _ERRORS = {
     "offset": (OFFSET, lambda p: 0.05 * p["gear_gain"] * p["maximum_force"], 0.2),
     "load": (LOAD, lambda p: 0.5 * p["load_friction"], 0.4),
     "coulomb": (COULOMB, lambda p: 0.5 * p["offset_friction"], 0.4),
+    "late": (LATE, lambda p: 0.3, 0.2),
     "viscous": (VISCOUS, lambda p: 0.3 * p["offset_friction"] / p["maximum_speed"], 0.4),
 }
 
@@ -177,6 +189,7 @@ def test_an_error_of_each_kind_is_found_from_strokes(parameters, name):
     add_torque_jumps(P, p)
     variance = (p["torque_constant"] * p["current_sigma"]) ** 2
     decay, noise_decay = np.exp(-0.004 / p["stiffness_correlation_time"]), np.exp(-0.004 / p["current_correlation_time"])
+    before = 0.0
     for step in range(4000):
         phase = 0.02 * step
         force = max(12e3 * (0.7 - np.cos(phase)), 0.0)
@@ -185,7 +198,8 @@ def test_an_error_of_each_kind_is_found_from_strokes(parameters, name):
         friction = np.clip(speed / 5.0, -1.0, 1.0)
         motor = (p["gear_gain"] + p["load_friction"] * friction) * force + inertia + p["offset_friction"] * friction
         slope = (0.15 * force + 250.0) * (force > 0.0)
-        _, h = _sensitivities(p, force, slope, speed, inertia, motor, friction, 0.0, (0.0, 0.0))
+        _, h = _sensitivities(p, force, slope, speed, inertia, motor, friction, 0.0, (0.0, 0.0), motor - before)
+        before = motor
         set_walks(walked, p, x, P, 0.0, 0.0, 0.0, 0.0, 0.0, 0.004)
         predict_errors(x, P, decay, noise_decay, variance, walked)
         innovation = h @ truth + rng.normal() * np.sqrt(variance) - h @ x

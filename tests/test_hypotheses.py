@@ -53,6 +53,7 @@ from emb_daemon.models.fusion import (
     GROWTH,
     HOUSING,
     INERTIA,
+    LATE,
     LOAD,
     NOISE,
     OF_THE_MODEL,
@@ -799,23 +800,23 @@ def test_torque_tells_of_each_error_what_the_balance_says():
     """The equations at the head of `models.fusion`, of errors of every kind at once."""
     rng, h = np.random.default_rng(4), np.zeros(STATES)
     x = rng.standard_normal(STATES)
-    spread, slope, force, warmth, leverage, gear, mean, speed, slow, turning, motor, u, v = rng.uniform(0.5, 2.0, 13)
+    spread, slope, force, warmth, leverage, gear, mean, speed, slow, turning, motor, changed, u, v = rng.uniform(0.5, 2.0, 14)
     s = new_state()[0]
     s["held"], s["drive"] = rng.uniform(0.5, 2.0, 2), 0.7
     to_force(h, s, spread, slope, force, warmth)
     off = spread * x[FAST] - slope * x[CONTACT] + force * x[SCALE] + slope * warmth * x[GROWTH]
     off += (s["held"] - 0.7) @ x[[*CREEPS]]
     assert h @ x == pytest.approx(off)
-    to_torque(h, leverage, gear, mean, force, speed, slow, turning, motor, u, v)
+    to_torque(h, leverage, gear, mean, force, speed, slow, turning, motor, changed, u, v)
     friction = mean * force * gear * x[LOAD] + mean * x[COULOMB] + speed * x[VISCOUS] + slow * x[SLOW]
-    lost = motor * (x[GAIN] + u * x[FADE] + v * x[HOUSING])
+    lost = motor * (x[GAIN] + u * x[FADE] + v * x[HOUSING]) + changed * x[LATE]
     assert h @ x == pytest.approx(leverage * off + friction - lost + turning * x[INERTIA] + x[NOISE] + x[OFFSET])
 
 
 def test_what_motor_and_friction_explain_has_the_standard_deviation_of_that():
     rng = np.random.default_rng(5)
     x, h, P = rng.standard_normal(STATES), rng.standard_normal(STATES), _covariance(rng)
-    of = [GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW]
+    of = [GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW, LATE]
     assert learned_torque(x, P, h) == pytest.approx((h[of] @ x[of], np.sqrt(h[of] @ P[np.ix_(of, of)] @ h[of])))
 
 

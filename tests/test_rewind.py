@@ -11,7 +11,7 @@ from emb_daemon.estimator.hypotheses import PRIOR_ODDS, STIFFNESS_JUMP, TORQUE_J
 from emb_daemon.estimator.paths import shift_zero
 from emb_daemon.estimator.records import new_state
 from emb_daemon.estimator.rewind import STOPS, forget_stroke, go_back, keep, keep_all
-from emb_daemon.models.fusion import CONTACT, CREEPS, OFFSET, SCALE, VISCOUS
+from emb_daemon.models.fusion import CONTACT, CREEPS, LATE, OFFSET, SCALE, VISCOUS
 from emb_daemon.offline import estimate
 
 
@@ -72,7 +72,11 @@ def test_what_was_known_some_stops_ago_is_known_again(parameters, s):
         _learn(s, float(by))
         keep(s)
     s["alternatives"]["log_odds"] = 50.0
+    s["error"][LATE], s["covariance"][LATE, LATE], s["covariance"][LATE, VISCOUS] = 0.4, 1e-4, 1e-9
     go_back(s, brake.ideal(parameters))
+    # What was between current and angle is undone, and what is left of it unknown.
+    assert s["error"][LATE] == 0.0 and s["covariance"][LATE, LATE] == pytest.approx(0.09)
+    assert np.count_nonzero(s["covariance"][LATE]) == 1
     assert _known(s) == pytest.approx(known)
     assert s["error"][[CONTACT, SCALE, *CREEPS]] == pytest.approx(0.0) and s["covariance"][VISCOUS, VISCOUS] == variance
     # Nothing is suspected, and what was learned meanwhile is not gone back to.

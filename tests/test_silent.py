@@ -222,6 +222,17 @@ def test_sigma_follows_a_contact_that_moves_while_the_motor_holds():
     assert off.max() > 4000.0 and np.max(off / estimates["sigma"][held]) < 3.5
 
 
+@pytest.mark.trial
+def test_a_current_a_third_of_a_cycle_late_is_no_other_contact():
+    """A foot that trembles on the pedal for half a minute: the torque is off by what it changes by in that third."""
+    _, moments, estimates, force_N = drive(("current_late",), 1, 401, drawn=True)
+    rows = 1e-9 * estimates["time_ns"] < moments["park"]
+    off = estimates["force"][rows] - force_N[rows]
+    beyond = np.abs(off) > 3.0 * np.hypot(estimates["sigma"][rows], 25.0)
+    print(f"{np.sqrt(np.mean(off**2)):.0f} N RMS, {np.abs(off).max():.0f} N at most, {beyond.mean():.2%} beyond three sigma")
+    assert np.sqrt(np.mean(off**2)) < 100.0 and beyond.mean() < 0.001
+
+
 def test_another_brake_has_its_share_of_forces_and_of_sizes(plant):
     own, half = (draw_drive(plant, np.random.default_rng(1), share=share) for share in (1.0, 0.5))
     forces = own[0].commands["mode"] == FORCE

@@ -24,6 +24,7 @@ from emb_daemon.adapt.snapshots import Snapshots, from_fields, to_fields
 from emb_daemon.calibration.parameters import moved
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.errors import Unavailable
+from emb_daemon.models.fusion import STATES
 
 INNER = np.dtype([("phase", "f8"), ("seen", "?")])
 RECORD = np.dtype([("angle", "f8"), ("count", "i8"), ("known", "?"), ("pads", "f8", (2, 3)), ("wheel", INNER)], align=True)
@@ -202,7 +203,7 @@ def test_a_calibration_that_is_replaced_before_the_first_sample_takes_no_snapsho
     ("name", "value"),
     [("clearance", 90.0), ("clearance_sigma", -1.0), ("scale", 10.0), ("creep", [0.0, 0.6]), ("growth", 1.0), ("disc", 5000.0),
      ("winding", 9.0), ("history", 1e9), ("temperature_sigma", None),
-     ("history_sigma", -1.0), ("error", [9e9] * 16), ("covariance", [[1e-4] * 15 + [2e-4]] * 16)],
+     ("history_sigma", -1.0), ("error", [9e9] * STATES), ("covariance", [[1e-4] * (STATES - 1) + [2e-4]] * STATES)],
 )  # fmt: skip
 def test_what_no_brake_can_have_known_is_not_used(driven, tmp_path, caplog, name, value):
     """The checksum is right, the values are not."""

@@ -15,6 +15,7 @@ from emb_daemon.models.fusion import (
     GROWTH,
     HOUSING,
     INERTIA,
+    LATE,
     LOAD,
     OFFSET,
     SCALE,
@@ -75,6 +76,18 @@ def test_what_was_not_watched_for_less_than_an_hour_may_have_changed_as_in_one(p
     assert np.array_equal(grown[0], grown[1])
     assert grown[2][[GAIN, OFFSET, LOAD, COULOMB]] == pytest.approx(2.0 * grown[1][[GAIN, OFFSET, LOAD, COULOMB]])
     assert np.sqrt(grown[2][CONTACT]) * p["gear_gain"] == pytest.approx(5e-6), "pads settle once"
+    assert [np.sqrt(each[LATE]) for each in grown] == pytest.approx([0.3, 0.3, 0.3]), "senders sample at any moment of a cycle"
+
+
+def test_the_time_between_current_and_angle_is_no_less_known_than_at_power_on(p):
+    """However long nothing shows it; two clocks have drifted by as much after some minutes."""
+    P, walked = np.zeros((STATES, STATES)), np.zeros(STATES)
+    for _ in range(int(300.0 / 0.1)):
+        set_walks(walked, p, np.zeros(STATES), P, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1)
+        P[LATE, LATE] += walked[LATE]
+    assert 0.28 < np.sqrt(P[LATE, LATE]) < 0.3
+    set_priors(P, p)
+    assert np.sqrt(P[LATE, LATE]) == pytest.approx(0.3)
 
 
 def test_that_a_brake_is_near_its_calibration_counts_as_an_observation_of_each_error(p):

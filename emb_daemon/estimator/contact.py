@@ -4,7 +4,7 @@ from math import sqrt
 
 import numpy as np
 
-from emb_daemon.estimator.fuse import needed_torque
+from emb_daemon.estimator.fuse import needed_torque, torque_change
 from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, doubt_memory, ordinary_stop, rest, turned
 from emb_daemon.estimator.resolver import nobody_brakes
@@ -142,7 +142,8 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
     speed = 0.5 * (m.speed + s.speed)
     slope = s.gear_slope
     load = mean_force + s.spring_force
-    to_torque(h, leverage, slope, s.friction_mean, load, speed, slow, accelerating, needed, s.winding, s.housing)
+    changed = torque_change(s, p, m, s.motor_torque - torque + predicted)
+    to_torque(h, leverage, slope, s.friction_mean, load, speed, slow, accelerating, needed, changed, s.winding, s.housing)
     learned, learned_sigma = learned_torque(s.error, s.covariance, h)
     # No force needs more. A single sample that is beyond it then leaves a fifteenth in the mean, less than counts as a clamp.
     largest = leverage * p.maximum_force

@@ -56,6 +56,7 @@ from emb_daemon.estimator.status import (
 from emb_daemon.estimator.straying import attribute_straying, straying_sigma
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
+    LATE_CYCLES,
     SLOW_RAD_PER_S,
     WINDING_S,
     add_drift_walks,
@@ -64,7 +65,7 @@ from emb_daemon.estimator.unknown import (
     torque_offset,
 )
 from emb_daemon.jit import Record, hypot, njit, sq
-from emb_daemon.models.alignment import at_bound, compare, interrupt, out_of_step
+from emb_daemon.models.alignment import at_bound, compare, in_step, interrupt, out_of_step
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import (
     CONTACT,
@@ -113,9 +114,6 @@ _NOTED = 0.003
 _NOTED_ERROR = 0.01
 #: Offset of the motor torque, over its standard deviation at power-on, beyond which no healthy current sensor is off.
 _OFFSET_LARGE = 2.0
-#: Part of a sample by which current and angle may differ in time, in addition to the angle's delay, which changes friction
-#: with it.
-_LATE = 0.3
 #: Log odds that a change reaches only after more samples than it takes to find a sensor's sudden fault (at most 12.5 a sample,
 #: and five samples): from then on it may explain a contradiction by the sliding motor.
 _LONG_LIKELY = 62.5
@@ -140,8 +138,11 @@ _STROKE_S = 0.25
 #: Share of the clearance by which pads are certainly apart: the motor must have gone back so far before a jump is proven, and
 #: only there do inertia and friction alone need a torque, whose moment is known whatever the contact angle is.
 _BACK = 0.3
-#: Counts of the resolver that the second difference of its angle must exceed.
+#: Counts of the resolver that the second difference of its angle must exceed, and standard deviations that a change of torque
+#: must: what noise then makes of a delay is a thirtieth of a cycle.
 _CLEAR = 4.0
+#: Part of a change of torque that a current which is up to half a cycle late shows in that cycle and the one before.
+_SHOWN = 0.5
 
 
 @njit
@@ -163,6 +164,23 @@ def needed_torque(s: Record, p: Record, m: Record, mean_force: float, leverage: 
     friction = s.friction_mean * (p.offset_friction + p.load_friction * load * s.gear_slope)
     slow = friction * exp(-0.5 * abs(m.speed + s.speed) / SLOW_RAD_PER_S)
     return slow, accelerating, leverage * load + p.offset_friction * s.gear_friction * s.friction_mean + accelerating
+
+
+@njit
+def torque_change(s: Record, p: Record, m: Record, wanted: float) -> float:
+    """Change in a cycle of the torque that force and motion want, ``wanted`` now, N m, of which a current that is not of the
+    same moment shows but a part; 0 where that is not known.
+
+    It must be clear of the noise of the speeds, which is in the unexplained torque as well and would look like a current that
+    is half a cycle late; the current's own noise would look like one that is early. And the current must have changed, too,
+    or one wrong speed would pass for a late current."""
+    if m.dt != CYCLE_S or s.dt_before != CYCLE_S or not (s.had_current and in_step(s.alignment)):
+        return 0.0
+    change = wanted - s.wanted
+    # Three speeds make a change: one of them twice.
+    clear = abs(change) > _CLEAR * sqrt(6.0) * p.inertia * s.speed_sigma / CYCLE_S
+    shown = abs(p.torque_constant * (m.current_q - s.current_before)) + abs(s.current_change) > _SHOWN * abs(change)
+    return change if clear and shown else 0.0
 
 
 @njit
@@ -224,7 +242,7 @@ def _moving_variance(s, p, m):
     from what a filter's inverse adds to the noise of a current, whatever part of it is behind the filter."""
     unknown_speed = s.speed_sigma if m.dt <= ONE_CYCLE_S else s.speed_sigma + abs(m.speed) + abs(s.speed)
     speed_torque = p.inertia * unknown_speed / CYCLE_S
-    apart = _LATE + (s.late + abs(effects.known_delay(p.effects))) / CYCLE_S
+    apart = LATE_CYCLES + (s.late + abs(effects.known_delay(p.effects))) / CYCLE_S
     late = apart * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
     lag = max(s.alignment.lag, 0.0)
     added = 2.0 * lag * (1.0 + lag) * sq(p.torque_constant * p.current_sigma)
@@ -253,9 +271,12 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     to_force(h, s, spread, s.slope, s.force, warmth)
     slope = s.gear_slope
     load = mean_force + s.spring_force
-    to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, s.winding, s.housing)
+    wanted = s.motor_torque - torque + leverage * mean_force
+    changed = torque_change(s, p, m, wanted)
+    s.wanted = wanted
+    to_torque(h, leverage, slope, s_mean, load, speed, slow_friction, accelerating, needed, changed, s.winding, s.housing)
     if not known and m.dt <= ONE_CYCLE_S and s.past_contact < -_BACK * s.clearance:
-        wanted = s.motor_torque - torque + leverage * mean_force + s.error[OFFSET]
+        wanted += s.error[OFFSET]
         compare(s.alignment, s.motor_torque, wanted, wanted - p.inertia * (m.speed - s.speed) / m.dt, sqrt(moving))
     else:
         interrupt(s.alignment)
@@ -277,7 +298,8 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
             continue
         to_force(h, s, spread, a.slope, s.force + a.shift, warmth)
         taken = needed + leverage * a.shift
-        to_torque(h, leverage, slope, s_mean, load + a.shift, speed, slow_friction, accelerating, taken, s.winding, s.housing)
+        load_a = load + a.shift
+        to_torque(h, leverage, slope, s_mean, load_a, speed, slow_friction, accelerating, taken, changed, s.winding, s.housing)
         second, variance_a = learn(a.error, a.covariance, s.gain, h, unexplained - leverage * a.shift, white, trusted)
         if trusted:
             least, most = drift_odds(s) if kind == DRIFT else (a.least, np.inf)
@@ -333,6 +355,8 @@ def fuse(
         _learn(s, p, m, trusted, known, warmth)
     else:
         s.torque_age += m.dt
+        s.wanted = np.nan
+    s.current_change = p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
     s.current_before, s.had_current = m.current_q, m.has_current
     if s.plausibility.verdict == TORQUE_FROZEN:
         # Nothing has jumped; a frozen current was evidence for every jump until it was found.

@@ -47,6 +47,7 @@ from emb_daemon.models.fusion import (
     GROWTH,
     HOUSING,
     INERTIA,
+    LATE,
     LOAD,
     NOISE,
     OF_THE_FORCE,
@@ -118,7 +119,7 @@ ALTERNATIVES = 5
 STIFFNESS_JUMP, TORQUE_JUMP, SLOW_CHANGE, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 
 #: States of motor and friction.
-_OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW)
+_OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW, LATE)
 
 #: One hypothesis beside the first, of which ``kind`` a kept jump is. ``log_odds`` against the first, which were ``prior`` when
 #: it was opened and are at least ``least``, and the ``share`` that it has by them, none if there is no such hypothesis;
@@ -423,10 +424,11 @@ def to_force(h: Floats, s: Record, spread: float, slope: float, force: float, wa
 @njit
 def to_torque(
     h: Floats, leverage: float, slope: float, friction_mean: float, force: float, speed: float, slow: float,
-    accelerating: float, motor_torque: float, winding: float, housing: float,
+    accelerating: float, motor_torque: float, changed: float, winding: float, housing: float,
 ) -> None:  # fmt: skip
     """Convert a sensitivity of the clamp force to that of the unexplained torque. ``slope`` of the gear; ``slow``,
-    ``accelerating`` and ``motor_torque`` N m: slow friction, torque of inertia, and total torque."""
+    ``accelerating`` and ``motor_torque`` N m: slow friction, torque of inertia, and total torque; ``changed`` N m: what the
+    total torque has changed by in a cycle."""
     for i in OF_THE_FORCE:
         h[i] *= leverage
     h[NOISE] = h[OFFSET] = 1.0
@@ -434,6 +436,7 @@ def to_torque(
     h[LOAD], h[COULOMB], h[VISCOUS] = friction_mean * force * slope, friction_mean, speed
     h[INERTIA] = accelerating
     h[SLOW] = slow
+    h[LATE] = -changed
 
 
 @njit

@@ -172,7 +172,7 @@ STATE = np.dtype(
         # Scratch of the filter.
         ("sensitivity", "f8", (2, STATES)),
         ("gain", "f8", (STATES,)),
-        ("current_before", "f8"),
+        *fields("f8", "current_before current_change wanted"),
         ("had_current", "?"),
         # Noise of the speed, rad/s: mean square of a motor that stands, and the larger of that and the calibration's.
         *fields("f8", "speed_square speed_sigma"),

@@ -9,8 +9,9 @@ import numpy as np
 
 from emb_daemon.estimator.hypotheses import fold, open_all
 from emb_daemon.estimator.paths import disc_warmth
-from emb_daemon.jit import Record, njit
-from emb_daemon.models.fusion import CONTACT, CREEPS, GROWTH, OFFSET, SCALE, STATES, copy_errors
+from emb_daemon.estimator.unknown import LATE_CYCLES
+from emb_daemon.jit import Record, njit, sq
+from emb_daemon.models.fusion import CONTACT, CREEPS, GROWTH, LATE, OFFSET, SCALE, STATES, copy_errors
 
 #: Stops to go back: a filter shows in one to three strokes, and those that swing count as stops each. Of 132 phases of three
 #: recorded logs with currents and angles that are late or filtered (`studies.silent injected --count 8 --seed 12 --faults
@@ -62,7 +63,9 @@ def go_back(s: Record, p: Record) -> None:
     _know(s, s.learned[0])
     for i in range(STATES):
         s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
+        s.covariance[LATE, i] = s.covariance[i, LATE] = 0.0
     s.error[OFFSET], s.covariance[OFFSET, OFFSET] = offset, variance
+    s.error[LATE], s.covariance[LATE, LATE] = 0.0, sq(LATE_CYCLES)
     keep_all(s)
     open_all(s, p)
 

@@ -50,6 +50,10 @@ _BEYOND, _BEYOND_SLOW = 4.2, 1.75
 #: to a fifth; with friction unknown to the calibration, such as grease at -20 degC, a wrong one has explained half. The same
 #: for a filter of the motion: a current sensor with twice the gain looks like such a filter, which explains two thirds.
 _EXPLAINS, _EXPLAINS_MOTION = 0.6, 0.8
+#: Share of the changes' sum of squares, beyond that of noise, by which both may differ if they are part of a cycle apart:
+#: twice the square of that part, if changes follow each other at random. 0 to 0.35 in a drive with a third of a cycle, 0.5 and
+#: more after a stroke with a filter of five cycles, which must not pass for a delay (tests/test_rewind.py).
+_PART = 0.4
 #: Cycles for which a change of torque remains in averaged torques (`models.contact`).
 _SETTLED = 16.0
 #: Stored samples, one more than the largest shift. Range of the angle over these samples below which the motor counts as
@@ -256,6 +260,14 @@ def _forget(a):
 def at_bound(a: Record) -> bool:
     """Whether the delay or filter may be larger than can be undone."""
     return a.delay in (-EARLIEST, LATEST) or abs(a.lag) == SLOWEST
+
+
+@njit
+def in_step(a: Record) -> bool:
+    """Whether the changes of both torques were found to coincide, but for part of a cycle."""
+    changes = max(a.current_square, a.motion_square)
+    coincide = a.shift_square[EARLIEST] < 2.0 * a.noise_square + _PART * changes
+    return coincide and a.informative >= _ENOUGH and not out_of_step(a)
 
 
 @njit

@@ -18,14 +18,15 @@ for noise, which takes slow model error for white noise. Here the filter estimat
     FADE      relative loss of motor torque per heat that the motor's own current left in the winding
     HOUSING   the same for the heat left in the motor's housing
     INERTIA   relative error of the inertia
+    LATE      cycles by which the current is late
 
     F = F_stiffness + sigma_stiffness FAST - G CONTACT + F SCALE + G dT GROWTH + (H_i - F) CREEP_i
     torque not explained by F_stiffness = D (F - F_stiffness) + s F LOAD + s COULOMB + w VISCOUS + T_f SLOW
-                                          - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA + NOISE + OFFSET
-                                          + white noise,  D = gamma + mu s
+                                          - T_m (GAIN + u FADE + v HOUSING) + J dw/dt INERTIA - T_m' LATE
+                                          + NOISE + OFFSET + white noise,  D = gamma + mu s
 
-H_i is the static force of the pads through a first-order lag. Slow errors stay correlated in time, and the standard
-deviation is that of the force.
+H_i is the static force of the pads through a first-order lag, and T_m' the change of the motor torque in a cycle. Slow errors
+stay correlated in time, and the standard deviation is that of the force.
 """
 
 from math import sqrt
@@ -34,9 +35,9 @@ from emb_daemon.jit import Floats, njit
 
 #: Number of states, and their places; creep's are two. Loops over a covariance run to the length of an array: to this number
 #: the compiler would unroll them, not vectorise them, and an update would take three times as long.
-STATES = 16
-(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW) = range(14)
-CREEPS = (14, 15)
+STATES = 17
+(FAST, CONTACT, GAIN, NOISE, OFFSET, SCALE, GROWTH, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW, LATE) = range(15)
+CREEPS = (15, 16)
 #: States that the model of the force takes in as soon as they are learned; all that the clamp force itself rests on.
 OF_THE_MODEL = (CONTACT, SCALE, GROWTH, *CREEPS)
 OF_THE_FORCE = (FAST, *OF_THE_MODEL)
