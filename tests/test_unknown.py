@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import unknown
-from emb_daemon.estimator.unknown import add_rest, excess, set_walks, softening_sigma, stay_possible, thickening
+from emb_daemon.estimator.unknown import add_rest, excess, set_priors, set_walks, softening_sigma, stay_possible, thickening
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
