@@ -62,7 +62,7 @@ INERTIA_SIGMA = 0.02
 #: own moments of one cycle (uniform: 0.29); and time in which the difference becomes another, s: two clocks that are 50 ppm
 #: apart, as crystals are, are a cycle apart after 80 s. Torque of a cycle in which it changes is off by the part of that
 #: change, for as long as it changes: of 363 phases of drawn drives (`studies.silent grid --count 2 --pairs 0 --seed 401
-#: --drawn`) 16 fail where that is noise of each sample, 12 where it is a state. A current that is a third of a cycle late
+#: --drawn`) 16 fail where that is noise of each sample, 13 where it is a state. A current that is a third of a cycle late
 #: while a foot trembles has been taken for another contact, 1.5 kN off.
 LATE_CYCLES, _LATE_DRIFTS_S = 0.3, 80.0
 #: Gear friction at the calibration's temperature, share; and what wear or another lubricant may do to it.
