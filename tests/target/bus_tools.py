@@ -81,6 +81,19 @@ class Recording:
 
 
 @contextlib.contextmanager
+def running() -> Iterator[subprocess.Popen[bytes]]:
+    """The daemon with the shipped configuration. No fixture: a test that is tried again must not find the first one's."""
+    config = PROJECT / "config" / "emb.yaml"
+    command = [sys.executable, "-m", "emb_daemon.cli.main", "run", "--config", str(config)]
+    process = subprocess.Popen([*command, "--interface", "socketcan", "--channel", CHANNEL])
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+@contextlib.contextmanager
 def playing(log: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
     """canplayer plays the log, in its own time unless options say otherwise, until it or the `with` block ends.
 

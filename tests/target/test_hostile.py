@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import gzip
 import itertools
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, CLAMP_FORCE, PROJECT, RESOLVER, Recording, answers, differ, playing, replayed, wait_for
+from bus_tools import CLAMP_FORCE, PROJECT, RESOLVER, Recording, answers, differ, playing, replayed, running, wait_for
 
 pytestmark = pytest.mark.target("can")
 
 ROAD = PROJECT.parent / "shared" / "measured" / "road_can" / "rav4" / "rav4_60s.log.gz"
-
-
-@pytest.fixture
-def daemon() -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "emb_daemon.cli.main", "run", "--config", str(PROJECT / "config" / "emb.yaml")]
-    process = subprocess.Popen([*command, "--interface", "socketcan", "--channel", CHANNEL])
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.wait(20)
 
 
 @pytest.fixture
@@ -43,17 +30,20 @@ def traffic(tmp_path: Path) -> Path:
 
 
 def test_no_sample_is_lost_in_road_traffic(
-    daemon: subprocess.Popen[bytes], record: Callable[..., Recording], rig_log: Path, traffic: Path, tmp_path: Path
+    record: Callable[..., Recording], rig_log: Path, traffic: Path, tmp_path: Path
 ) -> None:
     """With a road car's frames at full rate beside the samples, the daemon answers what was on the bus as replay does, which
     has all the time it wants: sample for sample, bit for bit, but for the sigma of the few whose stamps it did not believe.
     What the machine held up on its way to the bus, both hear late."""
-    with record(f",{CLAMP_FORCE:X}:7FF") as waiting:
-        wait_for("the daemon speaks", lambda: waiting.path.read_text().strip(), timeout_s=300)
-    with record(f",{CLAMP_FORCE:X}:7FF,100:700") as recording, playing(traffic), playing(rig_log) as player:
-        wait_for("ten seconds of samples", lambda: recording.path.read_text().count(f" {RESOLVER:03X}#") > 2500, timeout_s=60)
-        player.terminate()
-    assert daemon.poll() is None
+    with running() as daemon:
+        with record(f",{CLAMP_FORCE:X}:7FF") as waiting:
+            wait_for("the daemon speaks", lambda: waiting.path.read_text().strip(), timeout_s=300)
+        with record(f",{CLAMP_FORCE:X}:7FF,100:700") as recording, playing(traffic), playing(rig_log) as player:
+            wait_for(
+                "ten seconds of samples", lambda: recording.path.read_text().count(f" {RESOLVER:03X}#") > 2500, timeout_s=60
+            )
+            player.terminate()
+        assert daemon.poll() is None
     heard = tmp_path / "heard.log"
     heard.write_text("".join(f"{line}\n" for line in recording.path.read_text().splitlines() if line.split()[2][0] == "1"))
     live, alone = answers(recording.frames), replayed(heard)

@@ -5,26 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, PROJECT, playing, wait_for
+from bus_tools import CHANNEL, playing, running, wait_for
 
 pytestmark = pytest.mark.target("can")
 
 COMMAND = [sys.executable, "-m", "emb_daemon.cli.main"]
 BUS = ["--interface", "socketcan", "--channel", CHANNEL]
-
-
-@pytest.fixture
-def daemon() -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen([*COMMAND, "run", "--config", str(PROJECT / "config" / "emb.yaml"), *BUS])
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.wait(20)
 
 
 def monitor() -> dict | None:
@@ -36,13 +25,9 @@ def monitor() -> dict | None:
     return json.loads(done.stdout)["corners"]
 
 
-def test_a_script_sees_what_the_daemon_says(daemon: subprocess.Popen[bytes], rig_log: Path) -> None:
+def test_a_script_sees_what_the_daemon_says(rig_log: Path) -> None:
     """Four corners without a car; then one of them braking."""
     said: list[dict] = []
-    wait_for("the daemon speaks", lambda: said.append(monitor()) or said[-1], timeout_s=120, poll_s=1)
-    assert list(said[-1]) == ["FL", "FR", "RL", "RR"]
-    # Without a sample there is no force to be used, and the reason is told in words.
-    assert all(corner["clamp_force_kN"] is None and "resolver lost" in corner["reasons"] for corner in said[-1].values())
 
     def speaks_at_its_rate() -> bool:
         said.append(monitor() or said[-1])
@@ -54,9 +39,15 @@ def test_a_script_sees_what_the_daemon_says(daemon: subprocess.Popen[bytes], rig
         fast = front_left["forces_per_s"] > 150.0 and front_left["damaged"] < 0.01 * front_left["received"]
         return fast and front_left["clamp_force_kN"] is not None
 
-    with playing(rig_log, "-l", "i"):
-        wait_for("forces at their rate", speaks_at_its_rate, timeout_s=90)
-    assert daemon.poll() is None
+    with running() as daemon:
+        wait_for("the daemon speaks", lambda: said.append(monitor()) or said[-1], timeout_s=120, poll_s=1)
+        assert list(said[-1]) == ["FL", "FR", "RL", "RR"]
+        # Without a sample there is no force to be used, and the reason is told in words.
+        assert all(corner["clamp_force_kN"] is None and "resolver lost" in corner["reasons"] for corner in said[-1].values())
+
+        with playing(rig_log, "-l", "i"):
+            wait_for("forces at their rate", speaks_at_its_rate, timeout_s=90)
+        assert daemon.poll() is None
     front_left = said[-1]["FL"]
     # What else runs on the machine is in sigma.
     sigma = front_left["clamp_force_sigma_kN"]
