@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL
+from bus_tools import CHANNEL, RESOLVER
 
 from emb_daemon.adapt.memory import Memory
 from emb_daemon.resources import resource
@@ -21,19 +21,21 @@ pytestmark = pytest.mark.target("can")
 
 _REQUEST_ID, _FORCE_ID = 0x230, 0x200
 _RUN, _INVALID = 1, 15
+# Two samples of three.
+_MISSING_NS = 10_000_000
 _PATIENCE_S = 300.0
 
 
 def test_a_parked_car_is_asked_and_its_answer_accepted(tmp_path: Path) -> None:
-    """`emb-daemon run` and `emb-daemon simulate`, processes of their own; the forces stay valid throughout the
-    training that is accepted."""
+    """`emb-daemon run` and `emb-daemon simulate`, processes of their own; the forces stay valid, but where
+    the machine took the car's samples and no force could be."""
     config, state = tmp_path / "emb.yaml", tmp_path / "state"
     corner = f"{{FL: {{calibration: {resource('config/calibration.yaml')}}}}}"
     config.write_text(f"format: 1\ncorners: {corner}\nrealtime: {{fifo_priority: 60, lock_memory: false}}\n")
     command = [sys.executable, "-m", "emb_daemon.cli.main"]
     on_bus = ["-i", "socketcan", "-c", CHANNEL]
     environment = os.environ | {"STATE_DIRECTORY": str(state)}
-    bus = open_bus("socketcan", CHANNEL, [_REQUEST_ID, _FORCE_ID])
+    bus = open_bus("socketcan", CHANNEL, [_REQUEST_ID, _FORCE_ID, RESOLVER])
     daemon = subprocess.Popen([*command, "run", "--config", str(config), *on_bus], env=environment)
     car = subprocess.Popen(["chrt", "-f", "70", *command, "simulate", "--scenario", "park", "--corners", "1", *on_bus])
     try:
@@ -52,8 +54,9 @@ def test_a_parked_car_is_asked_and_its_answer_accepted(tmp_path: Path) -> None:
 
 
 def _listen(bus, end: float) -> dict[str, int]:
-    """Messages seen until one says Accepted: requests to run, accepted results, and invalid forces in the last training."""
-    seen, asked = {"requests": 0, "accepted": 0, "invalid": 0}, False
+    """Messages seen until one says Accepted: requests to run, accepted results, and forces that are invalid from the first
+    request on. Not those until the next training, if samples were missing on the bus."""
+    seen, invalid, asked, missing, sample_ns = {"requests": 0, "accepted": 0, "invalid": 0}, 0, False, False, 0
     while not seen["accepted"] and time.monotonic() < end:
         # In batches: the two processes that are watched share the machine, perhaps its only CPU, with this one.
         time.sleep(0.2)
@@ -62,11 +65,16 @@ def _listen(bus, end: float) -> dict[str, int]:
             if can_id == _REQUEST_ID:
                 asks = payload >> 16 & 3 == _RUN
                 if asks and not asked:
-                    # In a training that ended because the machine took the car's frames, no force could be valid.
-                    seen["invalid"] = 0
+                    seen["invalid"] += 0 if missing else invalid
+                    invalid, missing = 0, False
                 asked = asks
                 seen["requests"] += asks
                 seen["accepted"] += payload >> 25 & 15 == RESULT_ACCEPTED
             elif can_id == _FORCE_ID and seen["requests"]:
-                seen["invalid"] += payload >> 52 & 15 == _INVALID
+                invalid += payload >> 52 & 15 == _INVALID
+            elif can_id == RESOLVER:
+                missing |= int(frame["time_ns"]) - sample_ns > _MISSING_NS
+                sample_ns = int(frame["time_ns"])
+    # In a training that is accepted none is missing.
+    seen["invalid"] += invalid
     return seen
