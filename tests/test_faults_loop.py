@@ -221,6 +221,28 @@ def test_control_messages_of_the_kernel_are_read(order):
     far.close()
 
 
+@pytest.mark.parametrize("step_ns", [0, 1_000_000_000])
+def test_a_frame_that_was_queued_long_after_it_was_stamped_keeps_its_stamp(monkeypatch, step_ns):
+    """The kernel was held up in between: a log of the bus has that stamp, too. It is doubted only if the clock was set."""
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with near, far:
+        bus, real = RawCanSocket(near), time.time_ns
+        arrived_ns, stamp_ns = time.monotonic_ns(), real()
+        time.sleep(0.05)
+        bus.drain()
+        looked_ns = bus._looked_ns
+        monkeypatch.setattr(time, "time_ns", lambda: real() + step_ns)
+        stamp = struct.pack("=QiiQQ", 32, socket.SOL_SOCKET, rawcan._SO_TIMESTAMPNS, *divmod(stamp_ns, 1_000_000_000))
+        bus._received.control.view(np.uint8)[0, : len(stamp)] = np.frombuffer(stamp, np.uint8)
+        bus._received.headers["length"][0], bus._received.headers["control_length"][0] = 16, len(stamp)
+        bus._take(1, time.monotonic_ns())
+        heard_ns = bus._frames["time_ns"][0]
+        if step_ns:
+            assert looked_ns - 2 * CYCLE_NS <= heard_ns <= looked_ns
+        else:
+            assert abs(heard_ns - arrived_ns) < _CLOCKS_NS
+
+
 def test_a_hold_up_between_reading_two_clocks_moves_no_stamp(monkeypatch):
     """The scheduler may take the CPU away at any place; 10 ms there once made genuine frames look early."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)

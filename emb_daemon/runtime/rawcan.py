@@ -26,10 +26,10 @@ _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33
 _MSG_DONTWAIT = 0x40
 _EFF, _RTR, _ERR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _CAN_RAW_ERR_FILTER, _ERROR_CLASSES = 2, 0x1FFF_FFFF
-#: The kernel may be held up between stamping a frame and queueing it. A stamp is accepted if it is no older than this before
-#: the last look into the queue. If the clock was set instead, the error is at most this long, which the pipeline tolerates as
-#: jitter.
-_IN_TRANSIT_NS = 2 * CYCLE_NS
+#: If the clock was set while frames waited, a stamp is accepted only if it is no older than this before the last look into the
+#: queue: its error is at most this long, which the pipeline tolerates as jitter. So it does a clock that was set by less.
+#: Otherwise stamps of any age are the frames' own: the kernel may be held up between stamping a frame and queueing it.
+_TOLERATED_NS = 2 * CYCLE_NS
 
 _CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8"), ("time_ns", "i8")])
 _CAN_FRAME_BYTES = 16
@@ -184,9 +184,11 @@ class RawCanSocket:
         # The thread may be held up between two readings of clocks, so they give only an interval for the offset. The offset is
         # changed only if it is outside of this interval (the clock was set, or drifts), and then to its edge.
         real, after = time.time_ns(), time.monotonic_ns()
-        self._offset_ns = min(max(self._offset_ns, real - after), real - now)
+        before, self._offset_ns = self._offset_ns, min(max(self._offset_ns, real - after), real - now)
+        earliest = self._latest_ns
         # A sender's own stamp is of the monotonic clock, which is never set.
-        earliest = self._latest_ns if self._stamped else max(self._latest_ns, self._looked_ns - _IN_TRANSIT_NS)
+        if not self._stamped and abs(self._offset_ns - before) > _TOLERATED_NS:
+            earliest = max(earliest, self._looked_ns - _TOLERATED_NS)
         return _from_kernel(
             batch.raw, batch.headers, batch.control, count, self._stamped, self._offset_ns, earliest, now, self._frames
         )

@@ -39,9 +39,9 @@ class Frame(NamedTuple):
 
 
 def read_log(path: Path) -> list[Frame]:
-    """Classic data frames of a candump log."""
-    frames = []
-    for line in path.read_text().splitlines():
+    """Classic data frames of a candump log, which may still be written."""
+    frames, text = [], path.read_text()
+    for line in text[: text.rfind("\n") + 1].splitlines():
         stamp, _, frame = line.split()[:3]
         can_id, _, data = frame.partition("#")
         if len(can_id) == 3:
@@ -61,11 +61,11 @@ class Recording:
     def __enter__(self) -> Self:
         self._output = self.path.open("w")
         self._process = subprocess.Popen(self._command, stdout=self._output)
-        wait_for("candump listens", self._listens, timeout_s=60)
+        wait_for("candump listens", self._waits, timeout_s=60)
         return self
 
-    def _listens(self) -> bool:
-        # It has its socket and sleeps, waiting for frames.
+    def _waits(self) -> bool:
+        """It has its socket and sleeps: there is no frame that it has not read."""
         with contextlib.suppress(FileNotFoundError):
             process = Path("/proc", str(self._process.pid))
             sockets = [fd for fd in (process / "fd").iterdir() if os.readlink(fd).startswith("socket:")]
@@ -74,6 +74,8 @@ class Recording:
         return False
 
     def __exit__(self, *_: object) -> None:
+        # On a machine with little time, what was on the bus is still in its socket.
+        wait_for("candump has read its frames", self._waits, timeout_s=60)
         self._process.send_signal(signal.SIGINT)
         self._process.wait(60)
         self._output.close()
@@ -113,13 +115,6 @@ def playing(log: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
 def answers(frames: list[Frame]) -> list[bytes]:
     """Payloads behind the E2E header of the clamp force frames that answer a resolver sample, not of the predictions."""
     return [frame.data[2:] for frame in frames if frame.can_id == CLAMP_FORCE and frame.data[6] >> 4 < PREDICTED]
-
-
-def differ(live: list[bytes], other: list[bytes]) -> list[bytes]:
-    """Live answers that differ from others. Where the kernel was held up for two cycles between stamping a frame and queueing
-    it, the daemon does not believe the stamp, which a log of the bus has: age and sigma may then differ, the force never."""
-    assert [answer[:2] + answer[4:5] for answer in live] == [answer[:2] + answer[4:5] for answer in other]
-    return [one for one, another in zip(live, other, strict=True) if one != another]
 
 
 def replayed(log: Path, environment: dict[str, str] | None = None) -> list[bytes]:

@@ -66,24 +66,30 @@ def test_it_is_tried_once_the_machine_is_there_again(monkeypatch: pytest.MonkeyP
 @pytest.mark.target("can")
 @pytest.mark.parametrize(("priority", "counts"), [(60, False), (99, True)])
 def test_what_the_daemon_takes_is_no_machine_that_was_held_up(priority: int, counts: bool) -> None:
-    """A process of the daemon's priority that takes the only CPU, and one that goes before the one that watches."""
+    """A process of the daemon's priority that takes the only CPU, and one that goes before the one that watches. What the
+    machine itself takes meanwhile is lost, too: the least of some times counts."""
     anywhere = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(anywhere)})
     watch = Watch()
     try:
-        time.sleep(0.2)
-        before_s = watch.lost_s()
-        if not (child := os.fork()):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-            end_s = time.monotonic() + 0.5
-            while time.monotonic() < end_s:
-                pass
-            os._exit(0)
-        os.waitpid(child, 0)
-        time.sleep(0.2)
-        lost_s = watch.lost_s() - before_s
+        lost_s = [_lost_beside(priority, watch) for _ in range(5)]
     finally:
         watch.close()
         os.sched_setaffinity(0, anywhere)
-    print(f"{lost_s:.3f} s of 0.5 s lost")
-    assert lost_s > 0.25 if counts else lost_s < 0.1
+    print(f"{lost_s} s of 0.5 s lost each")
+    assert (min(lost_s) > 0.4) == counts
+
+
+def _lost_beside(priority: int, watch: Watch) -> float:
+    """Seconds, beside a process that takes its CPU for 0.5 s."""
+    time.sleep(0.2)
+    before_s = watch.lost_s()
+    if not (child := os.fork()):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        end_s = time.monotonic() + 0.5
+        while time.monotonic() < end_s:
+            pass
+        os._exit(0)
+    os.waitpid(child, 0)
+    time.sleep(0.2)
+    return watch.lost_s() - before_s
