@@ -30,6 +30,9 @@ _CAN_RAW_ERR_FILTER, _ERROR_CLASSES = 2, 0x1FFF_FFFF
 #: queue: its error is at most this long, which the pipeline tolerates as jitter. So it does a clock that was set by less.
 #: Otherwise stamps of any age are the frames' own: the kernel may be held up between stamping a frame and queueing it.
 _TOLERATED_NS = 2 * CYCLE_NS
+#: A change of the clocks' difference up to this is not followed. Both are slewed alike, so that it changes only when one is
+#: set; the time between reading one and the other must not move stamps against each other, as nothing does in a log.
+_APART_NS = 100_000
 
 _CAN_FRAME = np.dtype([("can_id", "u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u8"), ("time_ns", "i8")])
 _CAN_FRAME_BYTES = 16
@@ -54,6 +57,13 @@ _PASSING = (errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED, errno.ECONNRESET, err
 _REOPEN_NS = 100_000_000
 
 _libc = ctypes.CDLL(None, use_errno=True)
+
+
+def _clock_offset_ns() -> int:
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC, of the readings between which the least time passed: no stamp is then in the
+    future."""
+    readings = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(10)]
+    return min((after - before, real - before) for before, real, after in readings)[1]
 
 
 class _Batch:
@@ -145,7 +155,7 @@ class RawCanSocket:
         #: Time of the last look into the queue, time of the last frame, and time of the next attempt to open another socket.
         self._looked_ns = self._latest_ns = time.monotonic_ns()
         self._reopen_ns: int | None = None
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._offset_ns = _clock_offset_ns()
         self.dropped: int = 0
         self.unsent: int = 0
         self.down: bool = False
@@ -181,13 +191,14 @@ class RawCanSocket:
 
     def _take(self, count: int, now: int) -> tuple[int, int]:
         batch = self._received
-        # The thread may be held up between two readings of clocks, so they give only an interval for the offset. The offset is
-        # changed only if it is outside of this interval (the clock was set, or drifts), and then to its edge.
+        # The thread may be held up between two readings of clocks, so they give only an interval for the offset.
         real, after = time.time_ns(), time.monotonic_ns()
-        before, self._offset_ns = self._offset_ns, min(max(self._offset_ns, real - after), real - now)
+        moved = min(max(self._offset_ns, real - after), real - now) - self._offset_ns
+        if abs(moved) > _APART_NS:
+            self._offset_ns += moved
         earliest = self._latest_ns
         # A sender's own stamp is of the monotonic clock, which is never set.
-        if not self._stamped and abs(self._offset_ns - before) > _TOLERATED_NS:
+        if not self._stamped and abs(moved) > _TOLERATED_NS:
             earliest = max(earliest, self._looked_ns - _TOLERATED_NS)
         return _from_kernel(
             batch.raw, batch.headers, batch.control, count, self._stamped, self._offset_ns, earliest, now, self._frames
