@@ -24,10 +24,14 @@ class _Item(SimpleNamespace):
         self.runs += 1
 
 
-def _fail(item: _Item, share: float | None) -> None:
+def _watch(*lost_s: float, badly_s: float = 0.0) -> SimpleNamespace:
+    values = iter(lost_s)
+    return SimpleNamespace(lost_s=lambda: next(values), badly_s=lambda: badly_s)
+
+
+def _fail(item: _Item, share: float | None, badly_s: float = 0.0) -> None:
     """The item fails after 50 ms, of which this share was lost; None: where nothing watches."""
-    lost_s = iter((1.0, 1.0 + 0.05 * (share or 0.0), 2.0, 2.0))
-    running = tried_again(item, None if share is None else SimpleNamespace(lost_s=lambda: next(lost_s)))
+    running = tried_again(item, None if share is None else _watch(1.0, 1.0 + 0.05 * share, 2.0, 2.0, badly_s=badly_s))
     next(running)
     time.sleep(0.05)
     with pytest.raises(StopIteration):
@@ -51,12 +55,21 @@ def test_what_fails_while_the_machine_was_held_up_is_tried_once_more_and_said(mo
     assert said.startswith("HELD UP") and "too late" in said
 
 
+def test_what_fails_while_it_was_held_up_shortly_is_tried_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a test of minutes that is a small share, but long enough for a watchdog."""
+    item = _Item()
+    monkeypatch.setattr(machine, "CALM_S", 0.01)
+    _fail(item, 0.01, badly_s=time.monotonic() + 0.02)
+    assert item.runs == 1
+    with pytest.raises(AssertionError, match="too late"):
+        _fail(item, 0.01, badly_s=time.monotonic() - 1.0)
+
+
 def test_it_is_tried_once_the_machine_is_there_again(monkeypatch: pytest.MonkeyPatch) -> None:
     item, asleep = _Item(), []
     monkeypatch.setattr(machine, "CALM_S", 0.01)
     monkeypatch.setattr("machine.time.sleep", asleep.append)
-    lost_s = iter((1.0, 2.0, 2.0, 2.1, 2.1, 2.1))
-    running = tried_again(item, SimpleNamespace(lost_s=lambda: next(lost_s)))
+    running = tried_again(item, _watch(1.0, 2.0, 2.0, 2.1, 2.1, 2.1))
     next(running)
     with pytest.raises(StopIteration):
         running.throw(AssertionError("too late"))
