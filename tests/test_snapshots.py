@@ -62,6 +62,14 @@ def test_a_record_of_another_shape_is_named(change):
         from_fields(to_fields(record()) | change, RECORD)
 
 
+def test_a_snapshot_of_another_version_is_called_that(tmp_path):
+    """After an update the filter may have another number of states. Nothing is damaged then."""
+    Snapshots(tmp_path, RECORD).save("FL", SHIPPED, record(), 5)
+    later = np.dtype([(name, RECORD[name]) for name in RECORD.names] + [("added", "f8")])
+    found, _, warning = Snapshots(tmp_path, later).load("FL", SHIPPED)
+    assert found is None and "of another version of emb_daemon" in warning and "set aside" in warning
+
+
 @given(st.integers(0, 10_000), st.integers(1, 255))
 def test_any_damaged_byte_is_noticed(tmp_path_factory, position, flip):
     snapshots = Snapshots(tmp_path_factory.mktemp("snapshots"), RECORD)

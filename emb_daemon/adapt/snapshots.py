@@ -74,7 +74,8 @@ class Snapshots:
 
     def load(self, corner: str, calibration: Calibration) -> tuple[np.void | None, int, str | None]:
         """The snapshot of a corner with this calibration in use, or None; its time in ns (CLOCK_REALTIME); and a warning for
-        the log or None. A damaged file is set aside; one of another actuator or calibration is not used."""
+        the log or None. A file that is damaged, or of a version of this program whose state is another, is set aside; one of
+        another actuator or calibration is not used."""
         path = self.path(corner)
         found, warning = files.read_own(path, Snapshot, files.owner(_FORMAT, corner, calibration))
         if found is None:
@@ -82,4 +83,4 @@ class Snapshots:
         try:
             return from_fields(found.state, self._dtype), found.time_ns, None
         except ValueError as error:
-            return None, 0, f"{path}: damaged ({error}), {files.set_aside(path)}"
+            return None, 0, f"{path}: of another version of emb_daemon ({error}), {files.set_aside(path)}"

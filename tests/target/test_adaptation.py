@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from bus_tools import CHANNEL, RESOLVER
+from bus_tools import CHANNEL, RESOLVER, wait_for
 
 from emb_daemon.adapt.memory import Memory
 from emb_daemon.resources import resource
@@ -19,11 +19,14 @@ from emb_daemon.wire.contract import RESULT_ACCEPTED
 
 pytestmark = pytest.mark.target("can")
 
-_REQUEST_ID, _FORCE_ID = 0x230, 0x200
+_REQUEST_ID, _FORCE_ID, _STATUS_ID = 0x230, 0x200, 0x220
 _RUN, _INVALID = 1, 15
 # Two samples of three.
 _MISSING_NS = 10_000_000
 _PATIENCE_S = 300.0
+# It must hear the drive from its beginning: started after the first stops it does not know how warm the pads are, and asks
+# nothing for minutes.
+_START_S = 200.0
 
 
 def test_a_parked_car_is_asked_and_its_answer_accepted(tmp_path: Path) -> None:
@@ -35,15 +38,17 @@ def test_a_parked_car_is_asked_and_its_answer_accepted(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "emb_daemon.cli.main"]
     on_bus = ["-i", "socketcan", "-c", CHANNEL]
     environment = os.environ | {"STATE_DIRECTORY": str(state)}
-    bus = open_bus("socketcan", CHANNEL, [_REQUEST_ID, _FORCE_ID, RESOLVER])
-    daemon = subprocess.Popen([*command, "run", "--config", str(config), *on_bus], env=environment)
-    car = subprocess.Popen(["chrt", "-f", "70", *command, "simulate", "--scenario", "park", "--corners", "1", *on_bus])
+    bus = open_bus("socketcan", CHANNEL, [_REQUEST_ID, _FORCE_ID, _STATUS_ID, RESOLVER])
+    processes = [subprocess.Popen([*command, "run", "--config", str(config), *on_bus], env=environment)]
     try:
+        wait_for("the daemon speaks", lambda: len(bus.drain()), _START_S)
+        car = ["chrt", "-f", "70", *command, "simulate", "--scenario", "park", "--corners", "1", *on_bus]
+        processes.insert(0, subprocess.Popen(car))
         seen = _listen(bus, time.monotonic() + _PATIENCE_S)
     finally:
-        for process in (car, daemon):
+        for process in processes:
             process.send_signal(signal.SIGTERM)
-        statuses = [process.wait(20) for process in (car, daemon)]
+        statuses = [process.wait(20) for process in processes]
         bus.close()
     print(seen)
     assert seen["requests"] and seen["accepted"]
