@@ -227,10 +227,10 @@ def test_a_frame_that_was_queued_long_after_it_was_stamped_keeps_its_stamp(monke
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with near, far:
         bus, real = RawCanSocket(near), time.time_ns
+        bus._latest_ns -= 500_000_000
         arrived_ns, stamp_ns = time.monotonic_ns(), real()
         time.sleep(0.05)
-        bus.drain()
-        looked_ns = bus._looked_ns
+        looked_ns = bus._looked_ns = time.monotonic_ns()
         monkeypatch.setattr(time, "time_ns", lambda: real() + step_ns)
         stamp = struct.pack("=QiiQQ", 32, socket.SOL_SOCKET, rawcan._SO_TIMESTAMPNS, *divmod(stamp_ns, 1_000_000_000))
         bus._received.control.view(np.uint8)[0, : len(stamp)] = np.frombuffer(stamp, np.uint8)
