@@ -356,7 +356,8 @@ def _weighed(winner: Candidate, loser: Candidate, sure: bool) -> list[Candidate]
     """Two that were confounded, with what is said of them once the odds are known."""
     if sure:
         reason = f"explained by {winner.effect.name}: for this the calibration would have to be off by more than it may be"
-        return [replace(winner, confounded_with=None, manoeuvre=None), replace(loser, reason=reason, confounded_with=None)]
+        beaten = replace(loser, accepted=False, reason=reason, confounded_with=None, manoeuvre=None)
+        return [replace(winner, confounded_with=None, manoeuvre=None), beaten]
     return list(_confounded(winner, loser))
 
 
