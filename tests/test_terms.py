@@ -316,6 +316,34 @@ def test_torque_is_doubted_where_a_term_of_it_is_outside_of_its_range(calibratio
     assert runs[2]["innovation_sigma"][-1] > runs[1]["innovation_sigma"][-1]
 
 
+@pytest.mark.parametrize("memory", ["none", "lag", "deficit"])
+@pytest.mark.parametrize(("port", "path"), [("gear_gain", "torque_sigma"), ("stiffness", "stiffness_sigma")])
+def test_a_term_over_a_temperature_is_as_unsure_as_that_is(calibration, port, path, memory):
+    """Plates 40 K warmer than the caliper when the power comes are those of a disc that may be hotter than them by four times
+    as much, and than any that was recorded. What only remembers changes of temperature does not care."""
+    range_K, apart_K, remembers = 100.0, 40.0, memory == "deficit"
+    term = Term(
+        name="term:x", port=port, signal="disc_temperature", shape="odd_power", coefficient=0.2, scale=range_K, memory=memory,
+        centre=0.0 if remembers else 20.0, memory_scale=5.0, low=20.0, high=20.0 + range_K,
+    )  # fmt: skip
+
+    def relative(plates_C, *terms):
+        samples = drive()
+        samples["has_wheel_speed"], samples["has_thermocouple"], samples["caliper"] = True, True, 20.0
+        samples["inner_backplate"] = samples["outer_backplate"] = plates_C
+        found = estimate(samples, to_parameters(msgspec.structs.replace(calibration, terms=terms)))
+        clamped = found["force"] > 3000.0
+        return float(np.nanmedian(found[path][clamped] / found["force"][clamped]))
+
+    cold, warm = ((relative(plates), relative(plates, term)) for plates in (20.0, 20.0 + apart_K))
+    assert cold[1] < 1.1 * cold[0]
+    added = np.sqrt(max(warm[1] ** 2 - warm[0] ** 2, 0.0))
+    # Of a disc that is hotter by a standard deviation, less what thermocouples may differ by, the term is larger by so much.
+    # The other path tells a part of it.
+    larger = 0.2 * 4.0 * (apart_K - 3.0) / range_K
+    assert added < 0.01 if remembers else 0.5 * larger < added < larger
+
+
 # -- what a calibration may say ---------------------------------------------------------------------------------------
 
 _GOOD = {

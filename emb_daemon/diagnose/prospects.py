@@ -357,7 +357,7 @@ def _values(bench: Bench, form: Form, signals: list[np.ndarray]) -> np.ndarray:
 def _evaluate(bench: Bench, record: np.void, signals: list[np.ndarray]) -> np.ndarray:
     largest = bench.calibration.stiffness.maximum_force_N
     parts = zip(bench.trials, signals, strict=True)
-    return np.concatenate([evaluate(record, own, trial.log.samples["dt"], largest) for trial, own in parts])
+    return np.concatenate([evaluate(record, own, trial.dt, largest) for trial, own in parts])
 
 
 def record_of(form: Form) -> np.void:

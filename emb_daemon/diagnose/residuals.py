@@ -99,6 +99,11 @@ class Trial:
     def has_force(self) -> bool:
         return bool(np.isfinite(self.force_N).mean() > _RECORDED)
 
+    @cached_property
+    def dt(self) -> np.ndarray:
+        """Time steps of the samples, s, side by side in memory."""
+        return np.ascontiguousarray(self.log.samples["dt"])
+
 
 def make_trial(log: Log, index: int, parameters: np.void, mounted: Mapping[str, float]) -> Trial:
     """Prepare a log. ``parameters``: PARAMETERS, whose clamp force cuts the episodes where no reference is."""

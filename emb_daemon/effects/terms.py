@@ -77,7 +77,7 @@ TERM = np.dtype(
 )
 #: ``other``: the signal that multiplies; negative for none. ``most``: what the term adds or subtracts at most in its range.
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
-#: ``added`` and its standard deviation ``outside`` of the terms' range, or without their signals, by port in its unit;
+#: ``added`` and its standard deviation ``outside`` of the terms' range, or where signals are not known, by port in its unit;
 #: ``sigma`` and ``torque_sigma``: what the latter makes of the static force (N) and of the torque (N m).
 STATE = np.dtype(
     [
@@ -121,7 +121,13 @@ def _follow(signal, s, m):
 
 
 @njit
-def _remember(q, t, k, x, dt):
+def _forgotten(q, dt):
+    """What a term's memory forgets in ``dt`` s, as a share."""
+    return 1.0 - exp(-dt / q.memory_scale) if q.memory != _NONE and q.memory != _SLIP else 1.0
+
+
+@njit
+def _remember(q, t, k, x, forgotten):
     """Signal ``x`` of term ``k`` after its memory."""
     if q.memory == _NONE:
         return x
@@ -133,9 +139,19 @@ def _remember(q, t, k, x, dt):
     elif q.memory == _SLIP:
         t.memory[k] = min(max(t.memory[k] + (x - t.before[k]) / q.memory_scale, -1.0), 1.0)
     else:
-        t.memory[k] += (1.0 - exp(-dt / q.memory_scale)) * (x - t.memory[k])
+        t.memory[k] += forgotten * (x - t.memory[k])
     t.before[k] = x
     return t.memory[k] - x if q.memory == _DEFICIT else t.memory[k]
+
+
+@njit
+def _power(u, exponent):
+    # A search evaluates these three by the million, and pow() takes most of the time.
+    if exponent == 1.0:
+        return u
+    if exponent == 2.0:
+        return u * u
+    return sqrt(u) if exponent == 0.5 else u**exponent
 
 
 @njit
@@ -143,9 +159,9 @@ def _shape(q, z):
     """The term over its coefficient; a harmonic with its coefficients."""
     u = (z - q.centre) / q.scale
     if q.shape == _ODD:
-        return abs(u) ** q.exponent * (1.0 if u >= 0.0 else -1.0)
+        return _power(abs(u), q.exponent) * (1.0 if u >= 0.0 else -1.0)
     if q.shape == _EVEN:
-        return abs(u) ** q.exponent
+        return _power(abs(u), q.exponent)
     if q.shape == _SATURATION:
         return u / (1.0 + abs(u))
     if q.shape == _DECAY:
@@ -183,42 +199,93 @@ def _of_other(q, signal):
 
 
 @njit
-def _value(q, t, k, dt, maximum_force):
-    """Amount that term ``k`` adds at its port, in the port's unit; outside its range as shaped for `BEYOND` of its width, then
-    held, and never beyond its limits."""
-    x, share = t.signal[q.signal], 1.0
-    if q.other >= 0:
-        share = _of_other(q, t.signal)
-    if not (np.isfinite(x) and np.isfinite(share)):
-        return 0.0
-    share = min(max(share, 0.0), 1.0 + BEYOND)
+def _share(q, signal):
+    """What of the term the other signal lets act; one without such a signal."""
+    return _of_other(q, signal) if q.other >= 0 else 1.0
+
+
+@njit
+def _held(q, x):
     further = BEYOND * (q.high - q.low)
-    x = min(max(x, q.low - further), q.high + further)
-    if q.memory == _RESPONSE:
-        shaped = _remember(q, t, k, share * _shape(q, x), dt)
-    else:
-        shaped = share * _shape(q, _remember(q, t, k, x, dt))
-    shaped *= _gate(q, t.signal, maximum_force)
+    return min(max(x, q.low - further), q.high + further)
+
+
+@njit
+def _held_share(share):
+    return min(max(share, 0.0), 1.0 + BEYOND)
+
+
+@njit
+def _limited(q, signal, shaped, maximum_force):
+    """Amount that a term adds at its port of what it has ``shaped``, in the port's unit."""
+    shaped *= _gate(q, signal, maximum_force)
     added = shaped if q.shape == _HARMONIC else q.coefficient * shaped
     return min(max(added, -q.limit), q.growth)
 
 
 @njit
-def _sigma_outside(q, signal, added, speed_error):
+def _value(q, t, k, forgotten, maximum_force):
+    """Amount that term ``k`` adds at its port, in the port's unit; outside its range as shaped for `BEYOND` of its width, then
+    held, and never beyond its limits."""
+    x, share = t.signal[q.signal], _share(q, t.signal)
+    if not (np.isfinite(x) and np.isfinite(share)):
+        return 0.0
+    x, share = _held(q, x), _held_share(share)
+    if q.memory == _RESPONSE:
+        shaped = _remember(q, t, k, share * _shape(q, x), forgotten)
+    else:
+        shaped = share * _shape(q, _remember(q, t, k, x, forgotten))
+    return _limited(q, t.signal, shaped, maximum_force)
+
+
+@njit
+def _outside(q, x, share):
+    """Distance of a term's signals from their range, in widths of the range."""
+    distance = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
+    return distance + max(share - 1.0, 0.0) if q.other >= 0 else distance
+
+
+@njit
+def _sigma_outside(q, signal, added, speed_error, heat_error, maximum_force):
     """Standard deviation in the port's unit where a term leaves its range: that of the coefficient and the term's own size,
     times the distance of its signals from their range, in widths of the range; all that the term can be if a signal is not
     known. At the edge of the range the term is as certain as within. ``speed_error``: standard deviation of the disc's speed,
-    as a share of it."""
-    x = signal[q.signal]
+    as a share of it; ``heat_error``: of the temperatures of pads and disc, K."""
+    x, share = signal[q.signal], _share(q, signal)
     gate_known = not (q.gate == _TURNING or q.gate == _STANDING) or np.isfinite(signal[_WHEEL])
-    if not (gate_known and np.isfinite(x) and (q.other < 0 or np.isfinite(signal[q.other]))):
+    if not (gate_known and np.isfinite(x) and np.isfinite(share)):
         return q.most
-    outside = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
-    if q.other >= 0:
-        outside += max(_of_other(q, signal) - 1.0, 0.0)
+    outside = _outside(q, x, share)
     if speed_error > 0.0 and (q.signal == _WHEEL or q.other == _WHEEL):
         outside += speed_error * (q.exponent if q.signal == _WHEEL and q.shape in (_ODD, _EVEN) else 1.0)
-    return outside * hypot(q.sigma, added)
+    sigma = outside * hypot(q.sigma, added)
+    if heat_error > 0.0 and (_is_heat(q.signal) or _is_heat(q.other)):
+        sigma = max(sigma, _sigma_unsure(q, signal, added, heat_error, maximum_force))
+    return sigma
+
+
+@njit
+def _is_heat(signal):
+    """Whether a signal is a temperature that is estimated, with an error that all of them share."""
+    return signal in (_PADS, _DISC, _SURFACE)
+
+
+@njit
+def _sigma_unsure(q, signal, added, heat_error, maximum_force):
+    """The same if temperatures are off by their standard deviation: what that alters, and how far outside it would be. What
+    only remembers changes of a temperature is not altered."""
+    x, share = signal[q.signal], _share(q, signal)
+    by = heat_error if _is_heat(q.signal) else 0.0
+    of_share = heat_error / (q.other_high - q.other_from) if _is_heat(q.other) else 0.0
+    follows, told, most = q.memory != _DEFICIT and q.memory != _SLIP, added, 0.0
+    if follows:
+        told = _limited(q, signal, _held_share(share) * _shape(q, _held(q, x)), maximum_force)
+    for sign in (-1.0, 1.0):
+        there, beside, value = x + sign * by, share + sign * of_share, added
+        if follows:
+            value = _limited(q, signal, _held_share(beside) * _shape(q, _held(q, there)), maximum_force)
+        most = max(most, abs(value - told) + _outside(q, there, beside) * hypot(q.sigma, value))
+    return most
 
 
 @njit
@@ -252,11 +319,14 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
         t.added[port] = t.outside[port] = 0.0
     of_force = of_torque = 0.0
     speed_error = s.wheel.instead_unsure if s.wheel.contradicted or not m.has_wheel_speed else 0.0
+    heat_error = s.temperature_sigma if s.temperature_known else 0.0
     for k in range(e.count):
         q = e.term[k]
-        value = _value(q, t, k, m.dt, p.maximum_force)
+        value = _value(q, t, k, _forgotten(q, m.dt), p.maximum_force)
         t.added[q.port] += value
-        sigma = _sigma_outside(q, t.signal, value, speed_error)
+        # A term of the heat balance is itself a reason of the temperatures' error, which would feed on itself.
+        of_heat = q.port >= _SHARE or q.port == _PAD_FRICTION
+        sigma = _sigma_outside(q, t.signal, value, speed_error, 0.0 if of_heat else heat_error, p.maximum_force)
         if sigma > 0.0:
             t.outside[q.port] = hypot(t.outside[q.port], sigma)
             if q.port <= _STATIC_FORCE:
@@ -286,11 +356,15 @@ def unsure_heat(
 
 @njit
 def _follow_all(e, t, signals, dt, maximum_force, values):
+    forgotten, of_dt = 0.0, np.nan
     for row in range(len(signals)):
+        if dt[row] != of_dt:
+            of_dt = dt[row]
+            forgotten = _forgotten(e, of_dt)
         # The term's own signals, and those of the gates.
         for which in (e.signal, max(e.other, 0), _FORCE, _SPEED, _WHEEL):
             t.signal[which] = signals[row, which]
-        values[row] = _value(e, t, 0, dt[row], maximum_force)
+        values[row] = _value(e, t, 0, forgotten, maximum_force)
 
 
 def evaluate(term: np.void, signals: np.ndarray, dt: np.ndarray, maximum_force_N: float) -> np.ndarray:
