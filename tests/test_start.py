@@ -422,6 +422,30 @@ def test_where_somebody_may_brake_or_the_motor_moves_nothing_is_known(p, unknown
     assert _known_after(s, p, m, 3.0) == np.inf
 
 
+@pytest.mark.parametrize(("share", "after_s"), [(0.2, 0.1), (0.4, 10.0)])
+def test_a_motor_that_has_closed_since_it_was_open_further_may_press_lightly(p, unknown, share, after_s):
+    s, m = unknown
+    m["angle"] = s["angle"]
+    s["lowest"] = s["angle"] - share * p["clearance"]
+    assert _known_after(s, p, m, 11.0) == pytest.approx(after_s, abs=0.01)
+
+
+def test_a_light_brake_that_nobody_requests_is_not_where_the_brake_is_open(p):
+    """Opened for too short a time to be seen, then held at 300 N without a request: 0 N at a sigma of 26 N for the next drags,
+    as a drive began whose daemon was restarted in a jam."""
+    rest, light = 0.0, p["clearance"] + 1.5
+    up = brake.clamp(p, 12.0, 0.5)
+    opened = [np.full(200, up[-1]), np.linspace(up[-1], rest, 100), np.full(15, rest)]
+    pressed = [np.linspace(rest, light, 40), np.full(1000, light), np.linspace(light, rest, 40), np.full(100, rest)]
+    rows, force = brake.samples(p, np.concatenate([up, *opened, *pressed]))
+    first = len(up) + 100
+    rows, force = rows[first:].copy(), force[first:]
+    rows["dt"][0], rows["brake_request"][:220] = 0.0, 4000.0
+    estimates = estimate(rows, p)
+    assert _covered(estimates, force)
+    assert np.all(_unknown(estimates)[:-80]) and not _unknown(estimates)[-1]
+
+
 @pytest.mark.parametrize(("share", "torque_share", "known"), [(0.5, 0.0, True), (0.25, 0.0, False), (0.5, 0.03, False)])
 def test_who_closes_through_a_third_of_the_clearance_without_any_force_was_released(p, unknown, share, torque_share, known):
     s, m = unknown

@@ -35,6 +35,9 @@ _KNOWN_RAD, _UNKNOWN_RAD = 0.3, 1.0
 #: Largest torque of a released brake, as a share of what the largest force needs: the offset of an ordinary current sensor;
 #: times over which a start is observed, for which a released motor must stand, and after which it must be off, s.
 _LOOSE, _SEEN_S, _STILL_S, _OFF_S = 0.03, 0.1, 0.1, 1.0
+#: Time for which a motor that has closed from where it was open further stands, before that counts as released, s: longer than
+#: a light brake that nobody requests, and than a pause of one.
+_WAITS_S = 10.0
 #: Friction state from which the motor slides; share of the clearance that must be passed; share of the largest force's torque
 #: that counts as none, because a clamped brake would have gained more over that travel.
 _SLIDING, _PASSED, _FREE = 0.9, 0.3, 0.02
@@ -52,6 +55,7 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
     loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force
     # A gap may be lost frames, also the first: only a log none of whose samples come a cycle apart is at a reduced rate.
     s.full_rate = s.full_rate or 0.0 < m.dt <= ONE_CYCLE_S
+    s.lowest = min(s.lowest, m.angle)
     if not s.seen and s.since_start_s < _SEEN_S:
         # The torque must be averaged over some samples.
         s.since_start_s += m.dt
@@ -60,7 +64,7 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
     if s.unknown and _passed_clearance(s, p, m):
         place_contact(s, p, s.start_angle)
         s.unknown = False
-    elif s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S):
+    elif s.unknown and released and s.still_s >= (_STILL_S if loose else _OFF_S) and _is_open(s, p, m):
         place_contact(s, p, m.angle)
         # It was clamped until now, perhaps.
         doubt_memory(s, p, ordinary_stop(p, 1.0), 0.0)
@@ -78,6 +82,14 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
         open_yet = m.has_status and m.park_brake == 0.0 and not s.full_rate
         s.unknown = not (loose and released) and not open_yet
     s.seen = True
+
+
+@njit
+def _is_open(s, p, m):
+    """Whether the motor stands where it is open. One that has closed by a good part of the clearance since the start may press
+    lightly, as brakes that are dried or held ready do without a request, and less than shows in the torque."""
+    closed, _ = through_gear(p.gear, m.angle - s.lowest)
+    return closed <= _PASSED * s.clearance or s.still_s >= _WAITS_S
 
 
 @njit

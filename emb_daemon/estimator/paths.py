@@ -204,6 +204,7 @@ def shift_places(s: Record, moved: float) -> None:
     s.contact_angle += moved
     s.contact_anchor += moved
     s.start_angle += moved
+    s.lowest += moved
     s.gear_zero += moved
     s.zero_moved += moved
     for i in range(len(s.learned)):

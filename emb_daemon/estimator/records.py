@@ -95,8 +95,9 @@ STATE = np.dtype(
         # Whether some of the last samples may be forged.
         ("contested", "?"),
         # Whether the contact angle is unknown since the start, and what the release that ends it is known by; whether some
-        # samples came a cycle apart.
+        # samples came a cycle apart; the lowest angle since then.
         *fields("?", "unknown seen full_rate"),
+        ("lowest", "f8"),
         # Whether it goes on from a snapshot, whose heat is ``rested_s`` s old; clearance that counts from the released
         # position.
         ("resumed", "?"),

@@ -117,6 +117,7 @@ def _start(s, p, m):
     s.gear_zero = m.angle
     # Of a motor that turns at the first sample the released position is unknown.
     s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf
+    s.lowest = m.angle
     s.contact_angle, s.contact_anchor = m.angle + s.clearance, m.angle + p.clearance
     s.past_contact = -s.clearance
     s.friction_variance = 1.0
