@@ -430,6 +430,19 @@ def test_a_motor_that_has_closed_since_it_was_open_further_may_press_lightly(p, 
     assert _known_after(s, p, m, 11.0) == pytest.approx(after_s, abs=0.01)
 
 
+@pytest.mark.parametrize(("share", "known"), [(0.2, True), (0.4, False)])
+@pytest.mark.parametrize("stood", [True, False])
+def test_who_closes_from_where_it_paused_half_open_tells_nothing(p, unknown, share, known, stood):
+    """Neither if it pauses there, nor if it has been open further since."""
+    s, m = unknown
+    m["brake_request"], m["angle"], s["friction_mean"], s["stood_s"] = 1.0, s["angle"], 1.0, 2.0
+    s["start_angle"], s["lowest"] = np.inf if stood else s["angle"], s["angle"] - share * p["clearance"]
+    for angle in s["angle"] + np.linspace(0.0, 0.5 * p["clearance"], 100):
+        m["angle"] = angle
+        seek_release(s, p, m)
+    assert s["unknown"] != known
+
+
 def test_a_light_brake_that_nobody_requests_is_not_where_the_brake_is_open(p):
     """Opened for too short a time to be seen, then held at 300 N without a request: 0 N at a sigma of 26 N for the next drags,
     as a drive began whose daemon was restarted in a jam."""

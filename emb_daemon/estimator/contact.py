@@ -88,8 +88,14 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
 def _is_open(s, p, m):
     """Whether the motor stands where it is open. One that has closed by a good part of the clearance since the start may press
     lightly, as brakes that are dried or held ready do without a request, and less than shows in the torque."""
-    closed, _ = through_gear(p.gear, m.angle - s.lowest)
-    return closed <= _PASSED * s.clearance or s.still_s >= _WAITS_S
+    return _is_lowest(s, p, m.angle) or s.still_s >= _WAITS_S
+
+
+@njit
+def _is_lowest(s, p, angle):
+    """Whether the motor has been no more than a part of the clearance lower than ``angle``, rad."""
+    closed, _ = through_gear(p.gear, angle - s.lowest)
+    return closed <= _PASSED * s.clearance
 
 
 @njit
@@ -99,14 +105,14 @@ def _passed_clearance(s, p, m):
     if m.angle <= s.start_angle:
         # A torque while opening does not count against the closing motion.
         s.passed = s.opposing = 0.0
-        if s.stood_s > _OFF_S:
+        if s.stood_s > _OFF_S and _is_lowest(s, p, m.angle):
             # A reversal while half open is no released position.
             s.start_angle = m.angle
     elif s.friction_mean > _SLIDING and np.isfinite(s.balance):
         s.passed += 1.0
         s.opposing += (s.balance - s.opposing) / s.passed
     passed, _ = through_gear(p.gear, m.angle - s.start_angle)
-    closed = s.clearance > 0.0 and passed > _PASSED * s.clearance
+    closed = s.clearance > 0.0 and passed > _PASSED * s.clearance and _is_lowest(s, p, s.start_angle)
     sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * s.speed_sigma / CYCLE_S)
     free = abs(s.opposing) < _FREE * p.gear_gain * p.maximum_force
     return closed and s.passed > 0.0 and sigma / sqrt(s.passed) < 0.3 * _FREE * p.gear_gain * p.maximum_force and free
