@@ -192,6 +192,13 @@ def test_means_are_of_as_many_samples_as_asked_for():
     np.testing.assert_allclose((some.of(column[:, None])[:, 0] * some.per_mean), [0.0, 3.5, 6.0, 7.5, 0.0])
 
 
+def test_means_of_products_are_those_of_a_table_of_them():
+    rng, episode = np.random.default_rng(5), np.repeat([0, 1, 4], [7, 1, 12])
+    means = Averaging(episode, 3, rng.uniform(size=20) < 0.7)
+    columns, factor = list(rng.normal(size=(2, 20))), rng.normal(size=20)
+    np.testing.assert_allclose(means.of_products(columns, factor), means.of(np.column_stack(columns) * factor[:, None]))
+
+
 def test_episodes_end_when_the_brake_is_released_and_long_ones_are_cut():
     time = np.arange(0.0, 100.0, 0.004)
     force = np.where((time % 10.0 > 4.0) & (time < 50.0), 5000.0, 0.0)

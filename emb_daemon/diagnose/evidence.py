@@ -7,10 +7,12 @@ the regressor (Carter, Schnepel, Steigerwald, Rev. Economics and Statistics 99, 
 no part in the fit.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+
+from emb_daemon.jit import njit
 
 
 class Averaging:
@@ -36,6 +38,23 @@ class Averaging:
     def of(self, columns: np.ndarray) -> np.ndarray:
         """Weighted means of columns (N, k)."""
         return np.add.reduceat(columns * self.told[:, None], self._starts, axis=0) * self.per_mean[:, None]
+
+    def of_products(self, columns: Sequence[np.ndarray], factor: np.ndarray) -> np.ndarray:
+        """The same of each of the columns (N,) times a ``factor`` (N,), without a table of all of them."""
+        sums, told = np.empty((len(self._starts), len(columns))), factor * self.told
+        for index, column in enumerate(columns):
+            _sum_products(column, told, self._starts, sums, index)
+        return sums * self.per_mean[:, None]
+
+
+@njit
+def _sum_products(column, factor, starts, sums, index):
+    for run in range(len(starts)):
+        end = starts[run + 1] if run + 1 < len(starts) else len(column)
+        total = 0.0
+        for row in range(starts[run], end):
+            total += column[row] * factor[row]
+        sums[run, index] = total
 
 
 @dataclass(frozen=True)

@@ -342,7 +342,8 @@ def _screen_forms(
 
     def scored(members: list[int]) -> Scores:
         values = _values(bench, forms[members[0]], signals)
-        return screen.scores(np.column_stack([sensitivities[forms[index].port] * values for index in members]))
+        does = [sensitivities[forms[index].port] for index in members]
+        return screen.scores_of(screen.means.of_products(does, values * screen.keep))
 
     for members, part in zip(shapes.values(), bench.map(scored, shapes.values()), strict=True):
         u[members], a[members] = part.u, part.a
