@@ -105,7 +105,7 @@ def _passed_clearance(s, p, m):
     if m.angle <= s.start_angle:
         # A torque while opening does not count against the closing motion.
         s.passed = s.opposing = 0.0
-        if s.stood_s > _OFF_S and _is_lowest(s, p, m.angle):
+        if s.stood_s > _OFF_S:
             # A reversal while half open is no released position.
             s.start_angle = m.angle
     elif s.friction_mean > _SLIDING and np.isfinite(s.balance):
