@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -133,12 +134,17 @@ def answers(frames: list[Frame]) -> list[bytes]:
 
 
 def assert_same(live: list[bytes], replayed: list[bytes]) -> None:
-    """Answers are those of replay, bit for bit. A current that the kernel had stamped but not yet queued when its sample had
-    waited long enough is the exception, which nobody can see on the bus: on a busy machine one sample in several runs."""
-    pairs = enumerate(zip(live, replayed, strict=False))
-    differ = [(number, one.hex(), other.hex()) for number, (one, other) in pairs if one != other]
+    """Answers are those of replay, bit for bit, but for one in a thousand whose force or sigma differs by the last place.
+
+    That was seen on machines that were held up, and its cause is not known: a current that one of both missed would show in
+    dozens of answers, and by more."""
+    fields = struct.Struct("<HHBB")
+    pairs = enumerate(zip(map(fields.unpack, live), map(fields.unpack, replayed), strict=False))
+    differ = [(number, *pair) for number, pair in pairs if pair[0] != pair[1]]
     print(f"{len(differ)} answers differ from replay's (number, live, replayed): {differ[:20]}")
     assert len(differ) <= len(live) // 1000
+    for _, (force, sigma, *rest), (other, other_sigma, *other_rest) in differ:
+        assert abs(force - other) <= 1 and abs(sigma - other_sigma) <= 1 and rest == other_rest
 
 
 def replayed(log: Path, environment: dict[str, str] | None = None) -> list[bytes]:
