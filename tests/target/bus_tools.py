@@ -136,8 +136,8 @@ def answers(frames: list[Frame]) -> list[bytes]:
 def assert_same(live: list[bytes], replayed: list[bytes]) -> None:
     """Answers are those of replay, bit for bit, but for one in a thousand whose force or sigma differs by the last place.
 
-    That was seen on machines that were held up, and its cause is not known: a current that one of both missed would show in
-    dozens of answers, and by more."""
+    So much does a thermocouple's frame do that reaches a sample one cycle later (0 to 5 of 3750 answers), as it may where the
+    kernel was held up between stamping and queueing it. A current that is missed shows in hundreds of answers, and by more."""
     fields = struct.Struct("<HHBB")
     pairs = enumerate(zip(map(fields.unpack, live), map(fields.unpack, replayed), strict=False))
     differ = [(number, *pair) for number, pair in pairs if pair[0] != pair[1]]
