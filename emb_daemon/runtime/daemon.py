@@ -46,6 +46,9 @@ QUEUED_NS = 1_000_000
 #: Samples expected within this time of each other are estimated in one tick.
 _TOGETHER_NS = 400_000
 _STATUS_NS = 10_000_000_000
+#: Periods, 30 s, of which most may be missed before a restart is wanted. Late answers say that they are late; a start may take
+#: as long, without any, and what driving told about temperatures and wear is then less certain for minutes.
+_PATIENCE = 7_500
 #: Time for which a page that was read waits until the car is seen at rest: reading may have delayed the loop's reception.
 _SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
@@ -159,9 +162,9 @@ class Daemon:
         self.missed: int = 0
         self._active = sum(1 << CORNERS.index(name) for name in corners)
         #: Ticks run and missed until the last decision about the watchdog; since then: corners estimated, and corners whose
-        #: state is not a number.
+        #: state is not a number. Periods since most were met.
         self._before = (0, 0)
-        self._estimated = self._lost = 0
+        self._estimated = self._lost = self._slow = 0
         # Plain flags: an Event takes a lock, for which a signal handler could wait forever in the thread that it interrupts.
         self._stopping = self._reload_wanted = False
         #: What reads the files, and the thread that waits for it.
@@ -443,8 +446,9 @@ class Daemon:
     def _ping(self) -> bool:
         """Ping the watchdog if a restart would not help; otherwise log the reason and return False.
 
-        A restart would help if most ticks are missed, if a corner gets no estimates, or if its state is not a number. It would
-        not help against an interface that is down or gone.
+        A restart would help if a corner gets no estimates, or if its state is not a number. If most ticks are missed, it helps
+        where the loop itself has become slow, and costs more than it brings where others take the processor for some seconds:
+        so only if that lasts. It would not help against an interface that is down or gone.
         """
         met, missed = self.ticks - self._before[0], self.missed - self._before[1]
         silent = self._active & ~self._estimated
@@ -454,8 +458,9 @@ class Daemon:
             if self._lost >> index & 1
         ]
         amiss += [f"corner {name}: no estimate" for index, name in enumerate(CORNERS) if silent >> index & 1]
-        if missed > met:
-            amiss.append(f"{missed} of {met + missed} periods missed")
+        self._slow = self._slow + met + missed if missed > met else 0
+        if self._slow > _PATIENCE:
+            amiss.append(f"most of {self._slow} periods missed")
         self._before, self._estimated, self._lost = (self.ticks, self.missed), 0, 0
         if amiss:
             log.error("not pinging the watchdog: %s", "; ".join(amiss))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from bus_tools import CHANNEL, Recording, playing, wait_for
+from machine import BEFORE_ANOTHER
 from service_tools import (
     UNIT,
     active,
@@ -97,8 +98,14 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return first, later
 
 
+@pytest.fixture
+def nothing_of_it(request: pytest.FixtureRequest) -> None:
+    """The test finds a box without the package, when it is tried again as well."""
+    request.node.stash[BEFORE_ANOTHER] = lambda: apt_get("purge", "emb-daemon")
+
+
 def test_install_configure_run_upgrade_remove_purge(
-    packages: tuple[Path, Path], record: Callable[..., Recording], rig_log: Path
+    nothing_of_it: None, packages: tuple[Path, Path], record: Callable[..., Recording], rig_log: Path
 ) -> None:
     before = files_there()
 
