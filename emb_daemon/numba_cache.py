@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from llvmlite.binding import get_host_cpu_features
 from numba import typeof
 from numba.core import config, event, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
@@ -105,6 +106,23 @@ event.register("numba:compile", _compilations)
 _private: tempfile.TemporaryDirectory | None = None
 
 config.CACHE_DIR = str(_cache_folder())
+#: What LLVM's names for kinds of processors stand for, the best first.
+_KINDS = {
+    "x86-64-v3": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"),
+    "x86-64-v2": ("cx16", "popcnt", "sahf", "sse4.1", "sse4.2", "ssse3"),
+}
+
+
+def _choose_processor() -> None:
+    """Compile for a kind of processors instead of this very one: for AVX-512 LLVM needs minutes instead of
+    seconds, and the code is no faster. NUMBA_CPU_NAME says otherwise."""
+    features = get_host_cpu_features()
+    kind = next((kind for kind, needed in _KINDS.items() if all(features.get(one) for one in needed)), None)
+    if kind is not None and config.CPU_NAME is None:
+        config.CPU_NAME, config.CPU_FEATURES = kind, ""
+
+
+_choose_processor()
 # numba describes the arguments to every pass of its compiler, and would collect every field of a record for it: an eighth of
 # the time to compile. The name says the same.
 types.Record.__repr__ = types.Type.__repr__

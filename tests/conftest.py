@@ -17,13 +17,13 @@ settings.load_profile("project")
 _ROOT = Path(__file__).parent.parent
 
 #: Files that begin, in this order, the longest first, so that all workers end together. Of two workers on an empty cache one
-#: compiles the estimator, the other the library (a trial), in which nothing of the cache helps, or the simulated car: neither
-#: does it twice.
+#: compiles the estimator, the other the library (a trial), in which nothing of the cache helps, or the simulated car; later
+#: one compiles trainings, long before the other needs them: neither does it twice.
 _FIRST = (
     "test_ahead", "test_hypotheses", "test_plant", "test_effects", "test_diagnose_terms", "test_blind", "test_diagnose",
-    "test_adapt", "test_fleet", "test_formats", "test_diagnose_confirmation", "test_identify_fit", "test_rig",
-    "test_foreign_rig_identify", "test_foreign_rig", "test_diagnose_model", "test_identify_command", "test_examples",
-    "test_daemon", "test_interface", "test_identify_thermal",
+    "test_adapt", "test_formats", "test_diagnose_confirmation", "test_identify_fit", "test_rig",
+    "test_foreign_rig_identify", "test_foreign_rig", "test_fleet", "test_diagnose_model", "test_identify_command",
+    "test_examples", "test_daemon", "test_interface", "test_identify_thermal",
 )  # fmt: skip
 
 #: Fixtures that take so long that whoever asks for one is a trial.

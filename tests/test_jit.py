@@ -8,6 +8,7 @@ import pytest
 from numba import typeof, types
 
 import emb_daemon
+from emb_daemon import numba_cache
 from emb_daemon.ahead.library import installed_digest, source_digest
 from emb_daemon.estimator.fuse import fuse, take_sides
 from emb_daemon.estimator.records import new_state
@@ -92,6 +93,23 @@ def test_a_record_is_described_by_its_name():
     """Which is made once; numba asks for it in every pass of every function."""
     state = typeof(new_state()[0])
     assert repr(state) is state.name
+
+
+def test_code_is_for_a_kind_of_processors_and_not_for_the_newest_instructions_of_this_one(monkeypatch):
+    """For AVX-512 LLVM takes minutes for what it else does in seconds."""
+
+    def chosen(features, by_the_user=None):
+        monkeypatch.setattr(numba_cache, "get_host_cpu_features", lambda: dict.fromkeys(features, True) | {"sse4a": False})
+        monkeypatch.setattr(numba_cache.config, "CPU_NAME", by_the_user)
+        monkeypatch.setattr(numba_cache.config, "CPU_FEATURES", None)
+        numba_cache._choose_processor()
+        return numba_cache.config.CPU_NAME, numba_cache.config.CPU_FEATURES
+
+    old, new = numba_cache._KINDS["x86-64-v2"], numba_cache._KINDS["x86-64-v3"]
+    assert chosen([*old, *new, "avx512f"]) == chosen([*old, *new]) == ("x86-64-v3", "")
+    assert chosen([*old, *new[1:]]) == ("x86-64-v2", ""), "every one of a kind's instructions is needed"
+    assert chosen(old[1:]) == chosen(["neon"]) == (None, None), "numba then compiles for this processor"
+    assert chosen([*old, *new], "skylake") == ("skylake", None)
 
 
 def test_what_the_daemon_compiles_beside_the_estimator_is_what_the_estimator_calls(shipped_setup):
