@@ -16,7 +16,6 @@ from service_tools import (
     UNIT,
     active,
     exposure,
-    journal,
     journal_cursor,
     journal_since,
     main_pid,
@@ -114,10 +113,10 @@ def test_install_configure_run_upgrade_remove_purge(
 
     CONFIG.write_text(CONFIG.read_text().replace("can0", CHANNEL))
     command("check", "--config", CONFIG)
-    start = time.monotonic()
+    start, cursor = time.monotonic(), journal_cursor()
     systemctl("enable", "--now", UNIT)
     print(f"ready after {time.monotonic() - start:.1f} s")
-    assert "compiled ahead" in journal("--unit", UNIT)
+    assert "compiled ahead" in journal_since(cursor)
     assert prop("MemoryDenyWriteExecute") == "yes" and exposure() <= MAXIMAL_EXPOSURE
     resident = next(
         int(line.split()[1]) for line in Path(f"/proc/{main_pid()}/status").read_text().splitlines() if "VmRSS" in line
@@ -130,7 +129,7 @@ def test_install_configure_run_upgrade_remove_purge(
 
     # As another process of the same user it may read what the daemon shares.
     systemctl("start", _UDS)
-    took = wait_for("the UDS server is at work", lambda: "trouble codes in" in journal("--unit", _UDS), UDS_READY_S, poll_s=2)
+    took = wait_for("the UDS server is at work", lambda: "trouble codes in" in journal_since(cursor), UDS_READY_S, poll_s=2)
     print(f"UDS server ready after {took:.0f} s")
     process = Path("/proc", systemctl("show", _UDS, "--property=MainPID", "--value"))
     assert (process / "root/run/emb_daemon/estimates").stat().st_uid == process.stat().st_uid
