@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import processkit
 import pyarrow.parquet
 import pytest
 
@@ -231,6 +232,14 @@ def test_many_more_items_than_are_submitted_ahead_are_all_done_in_their_order(sc
 
 
 @pytest.mark.trial
+def test_a_process_works_on_one_cluster_after_another():
+    """Not one that has worked with Dask before."""
+    twice = "from emb_daemon.fleet.cluster import cluster, run\nfor text in 'a', 'bc':\n"
+    twice += "    with cluster(workers=1) as client:\n        print(run(client, len, [text]))"
+    done = processkit.python("-c", twice)
+    assert (done.returncode, done.stdout.split()) == (0, ["[1]", "[2]"]), done.stderr
+
+
 def test_a_worker_has_no_reader_of_files_that_another_process_reads():
     with cluster(workers=1) as client:
         [loaded] = client.run(lambda: {name: name in sys.modules for name in ("can", "asammdf")}).values()

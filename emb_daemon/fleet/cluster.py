@@ -52,7 +52,10 @@ def cluster(address: str | None = None, workers: int | None = None) -> Iterator[
     # Arrow's own allocator would keep the memory that the largest drive took.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     import dask
+    import distributed
 
+    # Where distributed's own settings are not there yet when ours are made, Dask takes all of them back with ours.
+    assert distributed.__name__ in dask.config.config
     with (
         dask.config.set(_SETTINGS | {"distributed.scheduler.allowed-failures": _LIVES}),
         _connect(address) if address else _start_workers(workers or len(os.sched_getaffinity(0))) as client,
