@@ -92,6 +92,19 @@ def inputs(service: None, rig_log: Path) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def patient() -> Iterator[None]:
+    """A watchdog that a machine held up for some seconds does not wake: what was answered before it is lost."""
+    drop_in = Path(f"/run/systemd/system/{UNIT}.d/patient.conf")
+    drop_in.parent.mkdir(parents=True, exist_ok=True)
+    drop_in.write_text("[Service]\nWatchdogSec=30\n")
+    systemctl("daemon-reload")
+    yield
+    drop_in.unlink()
+    systemctl("daemon-reload")
+    systemctl("restart", UNIT)
+
+
 # --- it starts, and as whom ------------------------------------------------------------------------------------------
 
 
@@ -164,8 +177,9 @@ def test_forces_come_250_times_a_second(inputs: None, record: Callable[..., Reco
                 )
 
 
-def test_a_reload_changes_nothing_else(inputs: None, record: Callable[..., Recording]) -> None:
+def test_a_reload_changes_nothing_else(patient: None, inputs: None, record: Callable[..., Recording]) -> None:
     """Files are read by another process, so that the loop answers every sample meanwhile."""
+    systemctl("restart", UNIT)
     wait_for_forces(record, timeout_s=WARM_START_S)
     before, cursor = (main_pid(), prop("NRestarts")), journal_cursor()
     with record(f",{CLAMP_FORCE:X}:7FF,{RESOLVER:X}:7FF") as recording:
@@ -248,19 +262,6 @@ def test_unusable_configuration_is_not_retried() -> None:
 
 
 # --- it says what replay says ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def patient() -> Iterator[None]:
-    """A watchdog that a machine held up for some seconds does not wake: what was answered before it is lost."""
-    drop_in = Path(f"/run/systemd/system/{UNIT}.d/patient.conf")
-    drop_in.parent.mkdir(parents=True, exist_ok=True)
-    drop_in.write_text("[Service]\nWatchdogSec=30\n")
-    systemctl("daemon-reload")
-    yield
-    drop_in.unlink()
-    systemctl("daemon-reload")
-    systemctl("restart", UNIT)
 
 
 def test_live_payloads_equal_replayed_ones(record: Callable[..., Recording], tmp_path: Path, patient: None) -> None:
