@@ -106,16 +106,18 @@ event.register("numba:compile", _compilations)
 _private: tempfile.TemporaryDirectory | None = None
 
 config.CACHE_DIR = str(_cache_folder())
-#: What LLVM's names for kinds of processors stand for, the best first.
+_V2 = ("cx16", "popcnt", "sahf", "sse4.1", "sse4.2", "ssse3")
+#: What LLVM's names for kinds of processors stand for (x86-64 psABI, micro-architecture levels), the best first. A virtual
+#: machine may hide any of it.
 _KINDS = {
-    "x86-64-v3": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"),
-    "x86-64-v2": ("cx16", "popcnt", "sahf", "sse4.1", "sse4.2", "ssse3"),
+    "x86-64-v3": (*_V2, "avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"),
+    "x86-64-v2": _V2,
 }
 
 
 def _choose_processor() -> None:
-    """Compile for a kind of processors instead of this very one: for AVX-512 LLVM needs minutes instead of
-    seconds, and the code is no faster. NUMBA_CPU_NAME says otherwise."""
+    """Compile for a kind of processors instead of this very one: for AVX-512 LLVM needs minutes instead of seconds, and the
+    code is no faster. NUMBA_CPU_NAME says otherwise."""
     features = get_host_cpu_features()
     kind = next((kind for kind, needed in _KINDS.items() if all(features.get(one) for one in needed)), None)
     if kind is not None and config.CPU_NAME is None:
