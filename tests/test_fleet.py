@@ -231,7 +231,6 @@ def test_many_more_items_than_are_submitted_ahead_are_all_done_in_their_order(sc
         assert run(client, abs, range(-50, 0)) == list(range(50, 0, -1))
 
 
-@pytest.mark.trial
 def test_a_process_works_on_one_cluster_after_another():
     """Not one that has worked with Dask before."""
     twice = "from emb_daemon.fleet.cluster import cluster, run\nfor text in 'a', 'bc':\n"
@@ -240,6 +239,7 @@ def test_a_process_works_on_one_cluster_after_another():
     assert (done.returncode, done.stdout.split()) == (0, ["[1]", "[2]"]), done.stderr
 
 
+@pytest.mark.trial
 def test_a_worker_has_no_reader_of_files_that_another_process_reads():
     with cluster(workers=1) as client:
         [loaded] = client.run(lambda: {name: name in sys.modules for name in ("can", "asammdf")}).values()
