@@ -128,9 +128,20 @@ def playing(log: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
         process.wait(60)
 
 
+def answering(frames: list[Frame]) -> list[Frame]:
+    """The clamp force frames that answer a resolver sample, not the predictions."""
+    return [frame for frame in frames if frame.can_id == CLAMP_FORCE and frame.data[6] >> 4 < PREDICTED]
+
+
 def answers(frames: list[Frame]) -> list[bytes]:
-    """Payloads behind the E2E header of the clamp force frames that answer a resolver sample, not of the predictions."""
-    return [frame.data[2:] for frame in frames if frame.can_id == CLAMP_FORCE and frame.data[6] >> 4 < PREDICTED]
+    """Payloads behind the E2E header of those."""
+    return [frame.data[2:] for frame in answering(frames)]
+
+
+def waits(frames: list[Frame]) -> list[float]:
+    """Time from each resolver sample to its answer, s."""
+    asked = [frame.time_s for frame in frames if frame.can_id == RESOLVER]
+    return [answer.time_s - time_s for time_s, answer in zip(asked, answering(frames), strict=False)]
 
 
 def assert_same(live: list[bytes], replayed: list[bytes]) -> None:
