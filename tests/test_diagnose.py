@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -123,18 +124,24 @@ def _shows_the_disc(result, um):
     assert np.hypot(found["order_1_cosine_um"], found["order_1_sine_um"]) == pytest.approx(um, rel=0.1)
 
 
+@pytest.fixture(scope="module")
+def of_long_drags(calibration):
+    """What is found in three drags over the same disc, by where the wheels stand when they begin."""
+    return cache(lambda wheels_rad: diagnose([*_drags(calibration, 1.5, (0.5, 0.5, 0.5), wheels_rad)], calibration))
+
+
 @pytest.mark.trial
 @pytest.mark.parametrize("wheels_rad", _STARTS)
-def test_a_few_long_drags_show_an_uneven_disc(calibration, wheels_rad):
+def test_a_few_long_drags_show_an_uneven_disc(of_long_drags, wheels_rad):
     """Three episodes, but a hundred turns of the disc in each; `diagnose` itself asks for such drags."""
-    result = diagnose([*_drags(calibration, 1.5, (0.5, 0.5, 0.5), wheels_rad)], calibration)
+    result = of_long_drags(wheels_rad)
     assert len(result.accepted) == 1
     _shows_the_disc(result, 1.5)
 
 
 @pytest.mark.trial
-def test_the_disc_is_right_whatever_is_named_beside_it(calibration):
-    _shows_the_disc(diagnose([*_drags(calibration, 1.5, (0.5, 0.5, 0.5), COUNT_RAD)], calibration), 1.5)
+def test_the_disc_is_right_whatever_is_named_beside_it(of_long_drags):
+    _shows_the_disc(of_long_drags(COUNT_RAD), 1.5)
 
 
 @pytest.mark.trial

@@ -770,6 +770,19 @@ def test_a_kept_jump_is_proven_as_any_and_no_rival_of_its_successor(p, opened):
     assert s["jumps"] == 1.0 and s["force"] == before + 500.0
 
 
+@pytest.mark.parametrize(("behind", "goes_on"), [(0.5, True), (-3.0, True), (2.1, False)])
+def test_a_drift_that_may_have_been_what_was_accepted_goes_on_to_count(p, opened, behind, goes_on):
+    """A contact that moved in seconds looks like a jump of contact and stiffness that is wrong in the next stop."""
+    s = opened[0]
+    a = s["alternatives"]
+    a["log_odds"][[STIFFNESS_JUMP, DRIFT]], a["shift"][[STIFFNESS_JUMP, DRIFT]] = (20.0, 20.0 - behind), (100.0, 1100.0)
+    assert settle(s, p, True, 0.004)
+    open_others(s, p)
+    drift = a[DRIFT]
+    assert (drift["log_odds"], drift["shift"]) == ((-behind, 1000.0) if goes_on else (-2.0, 0.0))
+    assert (mix(s, np.zeros(STATES), 30.0, 0.0)[1] > 400.0) == goes_on
+
+
 @pytest.mark.parametrize(("before", "stiffness", "kept"), [(-np.inf, 10.0, 10.0), (-np.inf, 7.0, None), (12.0, 10.0, 12.0)])
 def test_the_likeliest_of_the_other_kind_is_kept_beside_a_proven_jump(p, opened, before, stiffness, kept):
     """As far behind as it is, unless that is beyond what it may fall to; what comes next may speak for it."""

@@ -271,10 +271,15 @@ def open_all(s: Record, p: Record) -> None:
 
 @njit
 def open_others(s: Record, p: Record) -> None:
-    """Open the others anew after a change of the first hypothesis, in addition to a kept jump."""
+    """Open the others anew after a change of the first hypothesis, in addition to a kept jump, and to a drift that is likelier
+    than one that begins now: it may have been what has changed.
+
+    Of 786 phases that `studies.silent grid` draws (--drawn --seed 613 --count 8, nine families of brake and pads, and --seed
+    617 --count 3) 35 fail if each drift begins anew, and 26 with this; the root mean square of their errors stays."""
     _open_jumps(s, p)
     _open(s, p, SLOW_CHANGE)
-    _open(s, p, DRIFT)
+    if not s.alternatives[DRIFT].log_odds > _DRIFT_ODDS:
+        _open(s, p, DRIFT)
 
 
 @njit
@@ -289,8 +294,9 @@ def _become_first(s, a):
     other = s.alternatives[TORQUE_JUMP if kind == STIFFNESS_JUMP else STIFFNESS_JUMP]
     if kept.kind == kind or kept.log_odds < other.log_odds:
         _keep(s, other)
-    kept.log_odds -= odds
-    kept.shift -= shift
+    for lasting in (KEPT_JUMP, DRIFT):
+        s.alternatives[lasting].log_odds -= odds
+        s.alternatives[lasting].shift -= shift
     if kept.log_odds <= kept.least:
         _forget_kept(s)
 
@@ -647,6 +653,8 @@ def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, floa
     for kind in range(DRIFT):
         a = s.alternatives[kind]
         w = a.share
+        if w == 0.0:
+            continue
         rest -= w
         apart = a.shift + spread * a.error[FAST] - first
         whole += w * apart
