@@ -781,6 +781,15 @@ def test_a_drift_that_may_have_been_what_was_accepted_goes_on_to_count(p, opened
     drift = a[DRIFT]
     assert (drift["log_odds"], drift["shift"]) == ((-behind, 1000.0) if goes_on else (-2.0, 0.0))
     assert (mix(s, np.zeros(STATES), 30.0, 0.0)[1] > 400.0) == goes_on
+    drift["shift"] = 1000.0
+    settle(s, p, False, 0.004)
+    assert drift["shift"] == 1000.0
+    drift["log_odds"] = -2.0
+    settle(s, p, False, 0.004)
+    assert drift["shift"] == (0.0 if goes_on else 1000.0), "once it is refuted, one begins anew"
+    drift["shift"] = 1000.0
+    settle(s, p, False, 0.004)
+    assert drift["shift"] == 1000.0
 
 
 @pytest.mark.parametrize(("before", "stiffness", "kept"), [(-np.inf, 10.0, 10.0), (-np.inf, 7.0, None), (12.0, 10.0, 12.0)])

@@ -121,10 +121,10 @@ STIFFNESS_JUMP, TORQUE_JUMP, SLOW_CHANGE, KEPT_JUMP, DRIFT = range(ALTERNATIVES)
 #: States of motor and friction.
 _OF_THE_TORQUE = (GAIN, LOAD, COULOMB, VISCOUS, FADE, HOUSING, INERTIA, SLOW, LATE)
 
-#: One hypothesis beside the first, of which ``kind`` a kept jump is. ``log_odds`` against the first, which were ``prior`` when
-#: it was opened and are at least ``least``, and the ``share`` that it has by them, none if there is no such hypothesis;
-#: ``age_s`` since it was opened, that in the clearance apart; ``slope`` N/rad at its own contact angle; ``shift`` N: its force
-#: over the first one's; ``told``: what of the odds a force sensor gave.
+#: One hypothesis beside the first. ``kind``: of a kept jump what it is, of a drift the change in whose place it is kept.
+#: ``log_odds`` against the first, which were ``prior`` when it was opened and are at least ``least``, and the ``share`` that
+#: it has by them, none if there is no such hypothesis; ``age_s`` since it was opened, that in the clearance apart; ``slope``
+#: N/rad at its own contact angle; ``shift`` N: its force over the first one's; ``told``: what of the odds a force sensor gave.
 ALTERNATIVE = np.dtype(
     [
         ("error", "f8", (STATES,)),
@@ -297,6 +297,7 @@ def _become_first(s, a):
     for lasting in (KEPT_JUMP, DRIFT):
         s.alternatives[lasting].log_odds -= odds
         s.alternatives[lasting].shift -= shift
+    s.alternatives[DRIFT].kind = kind
     if kept.log_odds <= kept.least:
         _forget_kept(s)
 
@@ -571,6 +572,10 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
         s.stops += 1.0
     for i in range(0 if released else DRIFT):
         s.alternatives[i].age_s += dt
+    drift = s.alternatives[DRIFT]
+    if drift.kind != DRIFT and drift.log_odds <= _likeliest_odds(s) + _DRIFT_ODDS:
+        # It was not what has changed, and nothing that it learned as such counts.
+        _open(s, p, DRIFT)
     a = likeliest(s)
     margin = _CLEARLY if a.age_s < _AMBIGUOUS_S else 0.0
     # Expected jumps need as much evidence as others, because otherwise one false jump would lead to the next.
