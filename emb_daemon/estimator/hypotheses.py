@@ -658,8 +658,6 @@ def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, floa
     for kind in range(DRIFT):
         a = s.alternatives[kind]
         w = a.share
-        if w == 0.0:
-            continue
         rest -= w
         apart = a.shift + spread * a.error[FAST] - first
         whole += w * apart
