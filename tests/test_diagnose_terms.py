@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from diagnosekit import drives
+from scipy.signal import lfilter
 
 from emb_daemon.calibration import terms as calibration_terms
 from emb_daemon.calibration.files import load_calibration, save_calibration
@@ -16,7 +17,7 @@ from emb_daemon.diagnose import model as model_module
 from emb_daemon.diagnose import selection as selection_module
 from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import Coordinate
-from emb_daemon.diagnose.diagnosis import diagnose, with_terms
+from emb_daemon.diagnose.diagnosis import _with_memory, diagnose, with_terms
 from emb_daemon.diagnose.evidence import Averaging, Evidence
 from emb_daemon.diagnose.forms import enumerate_forms, enumerate_products, harmonic, made_effect
 from emb_daemon.diagnose.model import Model
@@ -32,6 +33,7 @@ from emb_daemon.effects import REGISTRY
 from emb_daemon.offline import log_of
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.car import COUNT_RAD, COUNTER_RAD
+from emb_daemon.wire.contract import CYCLE_S
 from studies.blind import campaign
 
 
@@ -212,6 +214,18 @@ def test_where_a_log_leaves_the_range_of_a_term_is_said(calibration):
     assert torque.share > 0.05 and torque.reached[1] == pytest.approx(most, rel=0.01)
     [warm] = outside_range(bench, [product])
     assert warm.signal == "pad_temperature" and warm.found == (None, 21.0) and warm.reached[1] > 25.0
+    # Within the range of a signal a term may remember more of it than where it was found.
+    lag = msgspec.structs.replace(wide, high=1.01 * most, low=-1.0, memory="lag", memory_scale=20.0)
+    kept = np.exp(-CYCLE_S / 20.0)
+    slow = lfilter([1.0 - kept], [1.0, -kept], np.maximum(bench.trials[0].brake_torque_Nm, 0.0))
+    known = _with_memory(lag, bench, calibration)
+    assert known.memory_low == pytest.approx(0.0, abs=0.01 * most)
+    assert known.memory_high == pytest.approx(slow.max(), rel=0.1) and known.memory_high < 0.5 * most
+    assert outside_range(bench, [known]) == []
+    [torque] = outside_range(bench, [msgspec.structs.replace(known, memory_high=0.5 * known.memory_high)])
+    assert (torque.signal, torque.memory) == ("brake_torque", "lag") and torque.share > 0.05
+    [told] = _outside(SimpleNamespace(outside=[torque]))
+    assert "what it remembers of brake torque (lag) is outside the range in which term:wide was found" in told
     [told] = _outside(SimpleNamespace(outside=[warm]))
     assert "pad temperature is outside the range in which term:product was found" in told and "the range 21 °C" in told
 

@@ -268,6 +268,58 @@ def test_sigma_grows_outside_of_the_range(calibration):
     assert sigma_of(edge)[0] < 1.1 * none
 
 
+@pytest.mark.parametrize(("lasts_s", "is_doubted"), [(0.5, False), (10.0, True)])
+def test_sigma_grows_where_a_term_remembers_more_than_where_it_was_found(calibration, lasts_s, is_doubted):
+    """A disc that turns fast for long, as on a motorway, after a campaign of stops from the same speed: no signal leaves its
+    range, but what warms by it does."""
+    term = Term(
+        name="term:x", port="stiffness", memory="response", coefficient=0.3, memory_scale=10.0, memory_high=0.1,
+        memory_low=0.0, **_OVER_SPEED,
+    )  # fmt: skip
+    samples = drive()
+    samples["has_wheel_speed"] = True
+    samples["wheel_speed"] = np.where(np.cumsum(samples["dt"]) < 0.1, 0.0, 40.0)
+    samples["wheel_speed"][np.cumsum(samples["dt"]) > lasts_s] = 0.0
+    sigmas, forces = {}, {}
+    for name, own in {"known": term, "unknown": msgspec.structs.replace(term, memory_low=None, memory_high=None)}.items():
+        found = estimate(samples, held(to_parameters(msgspec.structs.replace(calibration, terms=(own,)))))
+        sigmas[name], forces[name] = found["stiffness_sigma"], found["stiffness_force"]
+    # A response goes on, as heat does.
+    np.testing.assert_array_equal(forces["known"], forces["unknown"])
+    assert (sigmas["known"].max() > 2.0 * sigmas["unknown"].max()) == is_doubted
+
+
+def test_what_a_term_remembers_is_held_beyond_the_range_in_which_it_was_found():
+    """A quarter of its width further on; unlike a response, it is what the shape was seen at."""
+    term = Term(
+        name="term:x", port="stiffness", signal="disc_speed", memory="lag", memory_scale=1.0, shape="odd_power", scale=40.0,
+        coefficient=0.4, low=0.0, high=40.0, memory_low=0.0, memory_high=8.0,
+    )  # fmt: skip
+    speed = np.where(np.arange(2500) < 5, 0.0, 40.0)
+    found = over(term, speed)
+    np.testing.assert_allclose(
+        found, 0.4 * np.minimum(over(msgspec.structs.replace(term, **_UNKNOWN), speed) / 0.4, 10.0 / 40.0)
+    )
+    assert found[-1] == pytest.approx(0.1) and found[20] < 0.04
+
+
+def test_a_term_at_the_limits_of_its_port_is_doubted_by_what_they_take(calibration):
+    """Either they are wrong or the term is."""
+    samples = drive()
+    samples["has_wheel_speed"], samples["wheel_speed"] = True, 40.0
+    product = Term(name="term:x", port="gear_gain", coefficient=0.9, other="disc_speed", other_high=40.0, **_OVER_SPEED)
+    found = {}
+    for size in (0.9, 1.2):
+        own = msgspec.structs.replace(product, coefficient=size)
+        found[size] = estimate(samples, held(to_parameters(msgspec.structs.replace(calibration, terms=(own,)))))
+    force = found[0.9]["stiffness_force"]
+    told = np.isfinite(found[0.9]["torque_sigma"]) & (force > 3e3)
+    np.testing.assert_array_equal(found[0.9]["torque_force"][told], found[1.2]["torque_force"][told])
+    taken = np.hypot(found[0.9]["torque_sigma"], 0.3 / 1.9 * force)[told]
+    np.testing.assert_allclose(found[1.2]["torque_sigma"][told], taken, rtol=0.15)
+
+
+_UNKNOWN = {"memory_low": None, "memory_high": None}
 _OVER_SPEED = {"signal": "disc_speed", "shape": "odd_power", "scale": 40.0, "low": 0.0, "high": 40.0}
 _WHILE_TURNING = {"signal": "clamp_force", "shape": "constant", "gate": "turning", "low": 0.0, "high": 2e4}
 
@@ -365,6 +417,10 @@ _GOOD = {
         ({"scale": 0.0}, "> 0.0"),
         ({"shape": "exec"}, "Invalid enum value"),
         ({"other": "disc_temperature", "other_high": 20.0}, "other_high: expected more than 20"),
+        ({"memory_low": 0.0, "memory_high": 1.0}, "memory_low: only a memory of lag, deficit, response, peak"),
+        ({"memory": "lag", "memory_low": 1.0, "memory_high": 1.0}, "memory_high: expected more than memory_low"),
+        ({"memory": "lag", "memory_low": 0.0}, "memory_high: expected more than memory_low"),
+        ({"memory": "lag", "memory_high": 1.0}, "memory_high: expected more than memory_low"),
     ],
 )
 def test_a_calibration_with_a_bad_term_is_refused(calibration, tmp_path, changed, said):
@@ -475,7 +531,7 @@ _EXPORTED = (
     Term(name="term:x2", port="stiffness", signal="clamp_force", memory="slip", shape="odd_power", coefficient=0.03,
          memory_scale=900.0, low=0.0, high=2e4),
     Term(name="term:x3", port="force", signal="clamp_force", memory="deficit", shape="odd_power", coefficient=500.0,
-         scale=1e4, memory_scale=0.4, low=0.0, high=2e4),
+         scale=1e4, memory_scale=0.4, low=0.0, high=2e4, memory_low=-500.0, memory_high=800.0),
     Term(name="term:x4", port="gear_friction", signal="motor_speed", memory="response", shape="even_power",
          coefficient=0.1, scale=50.0, exponent=1.5, memory_scale=0.4, low=-200.0, high=200.0,
          other="clamp_force", other_high=8e3),

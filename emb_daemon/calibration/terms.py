@@ -29,6 +29,8 @@ _GROWS = {
 }  # fmt: skip
 #: Temperature (degC) from which one that multiplies counts.
 _COLD_C = 20.0
+#: Memories that may hold, in another drive, what they never did where the term was found.
+REMEMBERING = ("lag", "deficit", "response", "peak")
 
 
 if TYPE_CHECKING:
@@ -85,6 +87,11 @@ class Term(Struct, kw_only=True):
     low: float
     #: High end of that range.
     high: float
+    #: Low end of the range of what it remembered where it was found: z of a lag, a deficit or a peak, which is held as the
+    #: signal is; the output of a response, which goes on. Outside of it sigma grows. None: the range is not known.
+    memory_low: float | None = None
+    #: High end of that range.
+    memory_high: float | None = None
     #: A second signal, to which the term is proportional: to its size, for a temperature to the distance above 20 °C. The
     #: hidden state of a response follows the product.
     other: _Signal | None = None
@@ -97,6 +104,11 @@ class Term(Struct, kw_only=True):
     def __post_init__(self) -> None:
         if not self.low < self.high:
             raise InvalidValue("high: expected more than low")
+        if (self.memory_low, self.memory_high) != (None, None):
+            if self.memory not in REMEMBERING:
+                raise InvalidValue(f"memory_low: only a memory of {', '.join(REMEMBERING)} has a range")
+            if self.memory_low is None or self.memory_high is None or not self.memory_low < self.memory_high:
+                raise InvalidValue("memory_high: expected more than memory_low")
         if self.sine and self.shape != "harmonic":
             raise InvalidValue("sine: only a harmonic has one")
         if self.other and not self.other_high > self.other_from:
@@ -171,6 +183,8 @@ def fill_terms(record: np.void, terms: tuple[Term, ...]) -> None:
         row["other_from"], row["other_high"] = term.other_from, term.other_high
         for name in ("coefficient", "sine", "sigma", "scale", "centre", "exponent", "memory_scale", "low", "high"):
             row[name] = getattr(term, name)
+        known = term.memory_low is not None
+        row["memory_low"], row["memory_high"] = (term.memory_low, term.memory_high) if known else (-np.inf, np.inf)
         least, most = term.reach
         # Within its range it is what it is, as long as a fit asks whether its port may bear that; beyond, no more than that.
         inside = (0.0, 0.0) if term.is_held else (-least, most)

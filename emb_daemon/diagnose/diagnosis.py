@@ -14,6 +14,7 @@ from emb_daemon import __version__
 from emb_daemon.calibration.curves import curve_at
 from emb_daemon.calibration.files import date_of_today
 from emb_daemon.calibration.parameters import moved, parameter, value_of
+from emb_daemon.calibration.terms import REMEMBERING, Term
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
 from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, left_out_residuals, quarters, validation_gains
@@ -26,7 +27,7 @@ from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, FORCE_CHANNELS, UNITS
 from emb_daemon.diagnose.screening import NO_RIVALS, Candidate
 from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import Progress, Selection
-from emb_daemon.diagnose.signals import Outside, outside_range
+from emb_daemon.diagnose.signals import Outside, outside_range, remembered
 from emb_daemon.diagnose.unexplained import Dependence, Left, dependences, is_beyond, least_dependence
 from emb_daemon.diagnose.warmth import HeatSearch, heat_bench
 from emb_daemon.effects.base import Effect
@@ -639,8 +640,18 @@ def with_terms(calibration: Calibration, selection: Selection) -> Calibration:
             sigma = float(np.max([model.fits[c.channel].sigmas.get(c, 0.0) for c in own]))
             logs = ", ".join(model.bench.sources)
             found = f"{date_of_today()} in {logs}"
-            kept.append(msgspec.structs.replace(term, sigma=sigma if np.isfinite(sigma) else 0.0, provenance=found))
+            term = msgspec.structs.replace(term, sigma=sigma if np.isfinite(sigma) else 0.0, provenance=found)
+            kept.append(_with_memory(term, model.bench, calibration))
     return msgspec.structs.replace(calibration, terms=tuple(kept))
+
+
+def _with_memory(term: Term, bench: Bench, calibration: Calibration) -> Term:
+    """The term with the range of what it remembered in the bench's logs, estimated with this calibration."""
+    if term.memory not in REMEMBERING:
+        return term
+    held = remembered(bench.under(calibration), term)
+    low, high = float(held.min()), float(held.max())
+    return msgspec.structs.replace(term, memory_low=low, memory_high=high) if low < high else term
 
 
 def _with_provenance(

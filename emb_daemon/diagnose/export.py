@@ -120,6 +120,12 @@ def source(term: Term, maximum_force_N: float, equation: str) -> str:
         ]
     if term.gate == "load":
         lines += ["#: Clamp force at which it acts in full, N.", f"_LARGEST_N = {maximum_force_N!r}"]
+    if term.memory != "response" and term.memory_low is not None and term.memory_high is not None:
+        further = BEYOND * (term.memory_high - term.memory_low)
+        lines += [
+            "#: The same of what it remembers.",
+            f"_LEAST, _MOST = {term.memory_low - further!r}, {term.memory_high + further!r}",
+        ]
     if term.memory != "none":
         lines += ['STATE = np.dtype([("begun", "?"), ("memory", "f8"), ("before", "f8")], align=True)']
     return "\n".join([*lines, "", "", *kernel, "", "", *_declaration(term, equation), "", *_MAIN]) + "\n"
@@ -137,6 +143,8 @@ def _kernel(term: Term) -> list[str]:
     if np.isfinite(term.limit):
         body = f"min(max({body}, -{term.limit!r}), {term.growth!r})"
     z = {"none": _HELD, "response": _HELD, "deficit": "s.memory - x"}.get(term.memory, "s.memory")
+    if term.memory != "response" and term.memory_low is not None:
+        z = f"min(max({z}, _LEAST), _MOST)"
     arguments = {"none": "p, signals", "slip": "p, s, signals"}.get(term.memory, "p, s, signals, dt")
     return [
         "@njit",

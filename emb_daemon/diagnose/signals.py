@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_daemon.calibration.terms import Term
+from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.calibration.types import to_parameters
+from emb_daemon.diagnose.held_heat import follow_signals, run_with_heat
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, Bench
 from emb_daemon.effects.base import HOOKS
-from emb_daemon.effects.terms import CLAMPED_N
+from emb_daemon.effects.terms import CLAMPED_N, PARAMETERS, recall
 from emb_daemon.models.wheel import wheel_angle
 from emb_daemon.offline.run import estimate, held
 from emb_daemon.offline.score import rmse
@@ -92,14 +93,28 @@ def signals(bench: Bench) -> dict[str, np.ndarray]:
     return {name: np.concatenate(parts) for name, parts in columns.items()}
 
 
+def remembered(bench: Bench, term: Term) -> np.ndarray:
+    """What a term remembers at every sample of all logs: z of a lag, a peak or a deficit, the output of a response."""
+    parameters = np.zeros(1, PARAMETERS)[0]
+    fill_terms(parameters, (term,))
+    largest, parts = bench.calibration.stiffness.maximum_force_N, []
+    for trial in bench.trials:
+        samples, on = trial.log.samples, held(to_parameters(bench.on(trial)))[0]
+        signals = follow_signals(samples, on, run_with_heat(samples, on)[1])
+        parts.append(recall(parameters["term"][0], signals, trial.dt, largest))
+    return np.concatenate(parts)
+
+
 class Outside(NamedTuple):
-    """A signal that leaves the range in which a term was ``found`` (None: no low end), and what it reaches, in its unit."""
+    """A signal that leaves the range in which a term was ``found`` (None: no low end), and what it reaches, in its unit. The
+    same of what the term remembers of it: ``memory``, in the signal's unit, of a response in shares of the term's size."""
 
     term: str
     signal: str
     share: float
     found: tuple[float | None, float]
     reached: tuple[float, float]
+    memory: str = "none"
 
 
 def outside_range(bench: Bench, terms: Iterable[Term]) -> list[Outside]:
@@ -108,17 +123,19 @@ def outside_range(bench: Bench, terms: Iterable[Term]) -> list[Outside]:
     there, result = signals(bench) if terms else {}, []
     for term in terms:
         always = HOOKS[term.port].channel == CHANNEL_OF_HEAT or not bench.clamps
-        ranges = [(term.signal, term.low, term.high)]
+        ranges = [(term.signal, term.low, term.high, "none", there.get(term.signal, np.zeros(0)))]
         if term.other:
-            ranges.append((term.other, -np.inf if term.other_from else -term.other_high, term.other_high))
-        for name, low, high in ranges:
-            signal = there.get(name, np.zeros(0))
+            low = -np.inf if term.other_from else -term.other_high
+            ranges.append((term.other, low, term.other_high, "none", there.get(term.other, np.zeros(0))))
+        if term.memory_low is not None and term.memory_high is not None:
+            ranges.append((term.signal, term.memory_low, term.memory_high, term.memory, remembered(bench, term)))
+        for name, low, high, memory, signal in ranges:
             signal = signal if always or not len(signal) else signal[there["clamp_force"] > CLAMPED_N]
             far = _FAR * (high - (low if np.isfinite(low) else term.other_from))
             share = float(np.mean((signal < low - far) | (signal > high + far))) if len(signal) else 0.0
             if share > _OFTEN:
                 found = low if np.isfinite(low) else None, high
-                result.append(Outside(term.name, name, share, found, (float(signal.min()), float(signal.max()))))
+                result.append(Outside(term.name, name, share, found, (float(signal.min()), float(signal.max())), memory))
     return result
 
 

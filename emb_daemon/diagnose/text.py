@@ -160,10 +160,11 @@ def _dead(diagnosis: Diagnosis) -> list[str]:
 def _outside(diagnosis: Diagnosis) -> list[str]:
     """Where a term holds the value of its range's edge, which is no more than a guess there."""
     told = []
-    for name, signal, share, (low, high), reached in diagnosis.outside:
-        unit, least = SIGNALS[signal], "" if low is None else f"{low:.3g} to "
+    for name, signal, share, (low, high), reached, memory in diagnosis.outside:
+        unit, least = "1" if memory == "response" else SIGNALS[signal], "" if low is None else f"{low:.3g} to "
+        of = in_words(signal) if memory == "none" else f"what it remembers of {in_words(signal)} ({memory})"
         told.append(
-            f"In {100.0 * share:.0f} % of the validation logs' samples {in_words(signal)} is outside the range in which "
+            f"In {100.0 * share:.0f} % of the validation logs' samples {of} is outside the range in which "
             f"{name} was found (there {reached[0]:.3g} to {reached[1]:.3g} {unit}, the range {least}{high:.3g} {unit}): "
             "there the term is a guess."
         )

@@ -69,16 +69,16 @@ CLAMPED_N = 150.0
 TERM = np.dtype(
     [
         *fields("i8", "port signal memory shape gate other"),
-        *fields(
-            "f8", "coefficient sine sigma scale centre exponent memory_scale low high limit growth most other_from other_high"
-        ),
+        *fields("f8", "coefficient sine sigma scale centre exponent memory_scale low high memory_low memory_high"),
+        *fields("f8", "limit growth most other_from other_high"),
     ],
     align=True,
 )
 #: ``other``: the signal that multiplies; negative for none. ``most``: what the term adds or subtracts at most in its range.
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
 #: ``added`` and its standard deviation ``outside`` of the terms' range, or where signals are not known, by port in its unit;
-#: ``sigma`` and ``torque_sigma``: what the latter makes of the static force (N) and of the torque (N m).
+#: ``sigma`` and ``torque_sigma``: what the latter makes of the static force (N) and of the torque (N m). ``cut``: what the
+#: limits of its port take away from each term.
 STATE = np.dtype(
     [
         ("signal", "f8", (len(SIGNALS),)),
@@ -88,6 +88,7 @@ STATE = np.dtype(
         ("begun", "i8", (MOST,)),
         ("memory", "f8", (MOST,)),
         ("before", "f8", (MOST,)),
+        ("cut", "f8", (MOST,)),
     ],
     align=True,
 )
@@ -142,6 +143,12 @@ def _remember(q, t, k, x, forgotten):
         t.memory[k] += forgotten * (x - t.memory[k])
     t.before[k] = x
     return t.memory[k] - x if q.memory == _DEFICIT else t.memory[k]
+
+
+@njit
+def _recalled(q, t, k):
+    """What term ``k`` remembers, as `_remember` returned it last."""
+    return t.memory[k] - t.before[k] if q.memory == _DEFICIT else t.memory[k]
 
 
 @njit
@@ -205,9 +212,9 @@ def _share(q, signal):
 
 
 @njit
-def _held(q, x):
-    further = BEYOND * (q.high - q.low)
-    return min(max(x, q.low - further), q.high + further)
+def _held(x, low, high):
+    further = BEYOND * (high - low)
+    return min(max(x, low - further), high + further)
 
 
 @njit
@@ -216,49 +223,66 @@ def _held_share(share):
 
 
 @njit
-def _limited(q, signal, shaped, maximum_force):
-    """Amount that a term adds at its port of what it has ``shaped``, in the port's unit."""
+def _unlimited(q, signal, shaped, maximum_force):
+    """Amount that a term would add at its port of what it has ``shaped``, in the port's unit."""
     shaped *= _gate(q, signal, maximum_force)
-    added = shaped if q.shape == _HARMONIC else q.coefficient * shaped
-    return min(max(added, -q.limit), q.growth)
+    return shaped if q.shape == _HARMONIC else q.coefficient * shaped
+
+
+@njit
+def _limited(q, signal, shaped, maximum_force):
+    """The same within the term's limits."""
+    return min(max(_unlimited(q, signal, shaped, maximum_force), -q.limit), q.growth)
 
 
 @njit
 def _value(q, t, k, forgotten, maximum_force):
     """Amount that term ``k`` adds at its port, in the port's unit; outside its range as shaped for `BEYOND` of its width, then
-    held, and never beyond its limits."""
+    held, and never beyond its limits. A response goes on, as heat does."""
     x, share = t.signal[q.signal], _share(q, t.signal)
+    t.cut[k] = 0.0
     if not (np.isfinite(x) and np.isfinite(share)):
         return 0.0
-    x, share = _held(q, x), _held_share(share)
+    x, share = _held(x, q.low, q.high), _held_share(share)
     if q.memory == _RESPONSE:
         shaped = _remember(q, t, k, share * _shape(q, x), forgotten)
     else:
-        shaped = share * _shape(q, _remember(q, t, k, x, forgotten))
-    return _limited(q, t.signal, shaped, maximum_force)
+        shaped = share * _shape(q, _held(_remember(q, t, k, x, forgotten), q.memory_low, q.memory_high))
+    wanted = _unlimited(q, t.signal, shaped, maximum_force)
+    added = min(max(wanted, -q.limit), q.growth)
+    t.cut[k] = wanted - added
+    return added
+
+
+@njit
+def _distance(x, low, high):
+    """Distance from a range, in its widths."""
+    return max(low - x, x - high, 0.0) / (high - low)
 
 
 @njit
 def _outside(q, x, share):
     """Distance of a term's signals from their range, in widths of the range."""
-    distance = max(q.low - x, x - q.high, 0.0) / (q.high - q.low)
+    distance = _distance(x, q.low, q.high)
     return distance + max(share - 1.0, 0.0) if q.other >= 0 else distance
 
 
 @njit
-def _sigma_outside(q, signal, added, speed_error, heat_error, maximum_force):
-    """Standard deviation in the port's unit where a term leaves its range: that of the coefficient and the term's own size,
-    times the distance of its signals from their range, in widths of the range; all that the term can be if a signal is not
-    known. At the edge of the range the term is as certain as within. ``speed_error``: standard deviation of the disc's speed,
-    as a share of it; ``heat_error``: of the temperatures of pads and disc, K."""
+def _sigma_outside(q, t, k, added, speed_error, heat_error, maximum_force):
+    """Standard deviation in the port's unit where term ``k`` leaves its range: that of the coefficient and its own size, times
+    the distance of its signals, and of what it remembers, from their ranges, in widths of the range; all that the term
+    can be if a signal is not known. At the edge of the range the term is as certain as within. Where its port's limits hold
+    it, either they or the term are wrong by what they take away. ``speed_error``: standard deviation of the disc's speed, as
+    a share of it; ``heat_error``: of the temperatures of pads and disc, K."""
+    signal = t.signal
     x, share = signal[q.signal], _share(q, signal)
     gate_known = not (q.gate == _TURNING or q.gate == _STANDING) or np.isfinite(signal[_WHEEL])
     if not (gate_known and np.isfinite(x) and np.isfinite(share)):
         return q.most
-    outside = _outside(q, x, share)
+    outside = _outside(q, x, share) + _distance(_recalled(q, t, k), q.memory_low, q.memory_high)
     if speed_error > 0.0 and (q.signal == _WHEEL or q.other == _WHEEL):
         outside += speed_error * (q.exponent if q.signal == _WHEEL and q.shape in (_ODD, _EVEN) else 1.0)
-    sigma = outside * hypot(q.sigma, added)
+    sigma = hypot(outside * hypot(q.sigma, added), t.cut[k])
     if heat_error > 0.0 and (_is_heat(q.signal) or _is_heat(q.other)):
         sigma = max(sigma, _sigma_unsure(q, signal, added, heat_error, maximum_force))
     return sigma
@@ -279,11 +303,11 @@ def _sigma_unsure(q, signal, added, heat_error, maximum_force):
     of_share = heat_error / (q.other_high - q.other_from) if _is_heat(q.other) else 0.0
     follows, told, most = q.memory != _DEFICIT and q.memory != _SLIP, added, 0.0
     if follows:
-        told = _limited(q, signal, _held_share(share) * _shape(q, _held(q, x)), maximum_force)
+        told = _limited(q, signal, _held_share(share) * _shape(q, _held(x, q.low, q.high)), maximum_force)
     for sign in (-1.0, 1.0):
         there, beside, value = x + sign * by, share + sign * of_share, added
         if follows:
-            value = _limited(q, signal, _held_share(beside) * _shape(q, _held(q, there)), maximum_force)
+            value = _limited(q, signal, _held_share(beside) * _shape(q, _held(there, q.low, q.high)), maximum_force)
         most = max(most, abs(value - told) + _outside(q, there, beside) * hypot(q.sigma, value))
     return most
 
@@ -326,7 +350,7 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
         t.added[q.port] += value
         # A term of the heat balance is itself a reason of the temperatures' error, which would feed on itself.
         of_heat = q.port >= _SHARE or q.port == _PAD_FRICTION
-        sigma = _sigma_outside(q, t.signal, value, speed_error, 0.0 if of_heat else heat_error, p.maximum_force)
+        sigma = _sigma_outside(q, t, k, value, speed_error, 0.0 if of_heat else heat_error, p.maximum_force)
         if sigma > 0.0:
             t.outside[q.port] = hypot(t.outside[q.port], sigma)
             if q.port <= _STATIC_FORCE:
@@ -355,7 +379,7 @@ def unsure_heat(
 
 
 @njit
-def _follow_all(e, t, signals, dt, maximum_force, values):
+def _follow_all(e, t, signals, dt, maximum_force, values, recalled):
     forgotten, of_dt = 0.0, np.nan
     for row in range(len(signals)):
         if dt[row] != of_dt:
@@ -365,10 +389,20 @@ def _follow_all(e, t, signals, dt, maximum_force, values):
         for which in (e.signal, max(e.other, 0), _FORCE, _SPEED, _WHEEL):
             t.signal[which] = signals[row, which]
         values[row] = _value(e, t, 0, forgotten, maximum_force)
+        recalled[row] = _recalled(e, t, 0)
 
 
 def evaluate(term: np.void, signals: np.ndarray, dt: np.ndarray, maximum_force_N: float) -> np.ndarray:
     """Amount that a term (TERM) adds at its port for signals of shape (n, signals), ``dt`` s apart, in the port's unit."""
-    values = np.zeros(len(signals))
-    _follow_all(term, np.zeros(1, STATE)[0], signals, np.ascontiguousarray(dt), maximum_force_N, values)
-    return values
+    return _followed(term, signals, dt, maximum_force_N)[0]
+
+
+def recall(term: np.void, signals: np.ndarray, dt: np.ndarray, maximum_force_N: float) -> np.ndarray:
+    """What a term (TERM) remembers at the same samples: z of a lag, a peak or a deficit, the output of a response."""
+    return _followed(term, signals, dt, maximum_force_N)[1]
+
+
+def _followed(term, signals, dt, maximum_force_N):
+    values, recalled = np.zeros((2, len(signals)))
+    _follow_all(term, np.zeros(1, STATE)[0], signals, np.ascontiguousarray(dt), maximum_force_N, values, recalled)
+    return values, recalled
