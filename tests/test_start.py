@@ -4,6 +4,7 @@ import brake
 import numpy as np
 import pytest
 
+from emb_daemon.calibration.terms import Term, fill_terms
 from emb_daemon.estimator import restart
 from emb_daemon.estimator.contact import _start_clamped, seek_release
 from emb_daemon.estimator.records import ESTIMATE, new_state
@@ -289,6 +290,30 @@ def test_after_a_restart_the_time_since_the_snapshot_tells_what_pads_may_remembe
         sigmas[elapsed_s] = estimate(rested, p, restarted)["sigma"][1]
     assert sigmas[10.0] > 1.3 * estimate(rested, p)["sigma"][1] and sigmas[900.0] < 1.1 * p["stiffness_sigma"]
     assert sigmas[11.0] < 0.9 * sigmas[10.0], "a second later they have forgotten a third of it"
+
+
+_WARMS = Term(
+    name="term:x", port="gear_friction", signal="disc_speed", memory="response", shape="odd_power", scale=40.0,
+    coefficient=0.5, memory_scale=20.0, low=0.0, high=40.0, memory_low=0.0, memory_high=0.5,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("elapsed_s", "left"), [(1.0, 0.95), (20.0, 0.37), (3600.0, 0.0)])
+def test_what_terms_remember_outlasts_a_restart_by_its_own_time(p, elapsed_s, left):
+    """Grease that a fast disc has warmed is warm when a daemon is back after a second, and not after an hour."""
+    fill_terms(p["effects"]["terms"], (_WARMS,))
+    rows, state, snapshot = _standing(p)[0], new_state(), np.zeros(1, restart.SNAPSHOT)[0]
+    rows["has_wheel_speed"], rows["wheel_speed"] = True, 40.0
+    estimate(rows, p, state)
+    warm = state[0]["effects"]["terms"]["memory"][0]
+    assert warm > 0.1 and restart.take_snapshot(state[0], p, snapshot) and not restart.why_implausible(snapshot, p)
+    restarted = new_state()
+    restart.resume(restarted[0], p, snapshot, elapsed_s)
+    rows["wheel_speed"] = 0.0
+    estimate(rows[:1], p, restarted)
+    assert restarted[0]["effects"]["terms"]["memory"][0] == pytest.approx(left * warm, abs=0.01 * warm)
+    snapshot["terms_memory"][0] = 0.5 + 11.0 * 0.5
+    assert restart.why_implausible(snapshot, p) == "terms_memory"
 
 
 @pytest.mark.parametrize(("elapsed_s", "disc", "pads"), [(0.1, 200.0, 197.3), (300.0, 141.0, 69.4)])

@@ -9,7 +9,7 @@ from math import cos, exp, sin, sqrt
 
 import numpy as np
 
-from emb_daemon.jit import Record, fields, hypot, njit, sq
+from emb_daemon.jit import Floats, Record, fields, hypot, njit, sq
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
 #: Largest number of terms in a calibration.
@@ -63,6 +63,9 @@ _ALWAYS, _LOAD, _CLOSING, _OPENING, _TURNING, _STANDING = range(len(GATES))
 #: second drive was hotter or harder, a constant left two to four times as much as was left within the range.
 BEYOND = 0.25
 
+#: Widths of the range of what a term remembered beyond which it is no memory of this brake: ten campaigns' worth.
+_POSSIBLE = 10.0
+
 #: Clamp force from which the brake counts as clamped, N.
 CLAMPED_N = 150.0
 
@@ -78,13 +81,13 @@ TERM = np.dtype(
 PARAMETERS = np.dtype([("count", "i8"), ("term", TERM, (MOST,))], align=True)
 #: ``added`` and its standard deviation ``outside`` of the terms' range, or where signals are not known, by port in its unit;
 #: ``sigma`` and ``torque_sigma``: what the latter makes of the static force (N) and of the torque (N m). ``cut``: what the
-#: limits of its port take away from each term.
+#: limits of its port take away from each term. ``rested_s``: how long ago a restart's memories are of.
 STATE = np.dtype(
     [
         ("signal", "f8", (len(SIGNALS),)),
         ("added", "f8", (len(PORTS),)),
         ("outside", "f8", (len(PORTS),)),
-        *fields("f8", "sigma torque_sigma"),
+        *fields("f8", "sigma torque_sigma rested_s"),
         ("begun", "i8", (MOST,)),
         ("memory", "f8", (MOST,)),
         ("before", "f8", (MOST,)),
@@ -346,7 +349,7 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
     heat_error = s.temperature_sigma if s.temperature_known else 0.0
     for k in range(e.count):
         q = e.term[k]
-        value = _value(q, t, k, _forgotten(q, m.dt), p.maximum_force)
+        value = _value(q, t, k, _forgotten(q, m.dt + t.rested_s), p.maximum_force)
         t.added[q.port] += value
         # A term of the heat balance is itself a reason of the temperatures' error, which would feed on itself.
         of_heat = q.port >= _SHARE or q.port == _PAD_FRICTION
@@ -357,7 +360,35 @@ def look(e: Record, s: Record, p: Record, m: Record) -> None:
                 of_force += sq(sigma * _of_force(q.port, s))
             else:
                 of_torque += sq(sigma * _of_torque(q.port, s, p, m))
-    t.sigma, t.torque_sigma = sqrt(of_force), sqrt(of_torque)
+    t.sigma, t.torque_sigma, t.rested_s = sqrt(of_force), sqrt(of_torque), 0.0
+
+
+@njit
+def store(e: Record, t: Record, memory: Floats) -> None:
+    """Fill ``memory``, shape (MOST,), with what terms remember; NaN where they do not. What slips is not stored: it may have
+    moved before it is resumed."""
+    for k in range(MOST):
+        memory[k] = t.memory[k] if k < e.count and t.begun[k] != 0 and e.term[k].memory != _SLIP else np.nan
+
+
+@njit
+def resume(t: Record, memory: Floats, elapsed_s: float) -> None:
+    """Go on from what terms remembered ``elapsed_s`` s ago, as stored."""
+    for k in range(MOST):
+        if np.isfinite(memory[k]):
+            t.begun[k], t.memory[k] = 1, memory[k]
+    t.rested_s = elapsed_s
+
+
+@njit
+def is_possible(e: Record, memory: Floats) -> bool:
+    """Whether terms may remember what is stored: far beyond what they ever did where they were found, they do not."""
+    possible = True
+    for k in range(e.count):
+        q = e.term[k]
+        far = q.memory != _DEFICIT and _distance(memory[k], q.memory_low, q.memory_high) > _POSSIBLE
+        possible = possible and not far
+    return possible
 
 
 @njit

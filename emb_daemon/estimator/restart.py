@@ -8,6 +8,7 @@ from math import exp
 
 import numpy as np
 
+from emb_daemon.effects import terms
 from emb_daemon.estimator.paths import AFTER_A_RESTART, doubt_memory, ordinary_stop
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import (
@@ -63,6 +64,7 @@ SNAPSHOT = np.dtype(
         ("history", "f8"),
         ("temperature_sigma", "f8"),
         ("history_sigma", "f8"),
+        ("terms_memory", "f8", (terms.MOST,)),
     ],
     align=True,
 )
@@ -94,6 +96,7 @@ def take_snapshot(s: Record, p: Record, snapshot: Record) -> bool:
     _copy_pads(snapshot.pads, s.pads)
     snapshot.disc, snapshot.history = s.disc, s.history
     snapshot.temperature_sigma, snapshot.history_sigma = s.temperature_sigma, s.history_sigma
+    terms.store(p.effects.terms, s.effects.terms, snapshot.terms_memory)
     return True
 
 
@@ -128,6 +131,7 @@ def why_implausible(snapshot: Record, p: Record) -> str:
         "delay": -EARLIEST <= snapshot["delay"] <= LATEST,
         "lag": abs(snapshot["lag"]) <= SLOWEST,
         "filtered": 0.0 <= snapshot["filtered"] <= SLOWEST_S,
+        "terms_memory": terms.is_possible(p["effects"]["terms"], snapshot["terms_memory"]),
     }
     for name in ("pads", "disc", "growth_start"):
         if snapshot["temperature_known"]:
@@ -160,6 +164,7 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     s.alignment.delay, s.alignment.lag, s.lateness.filtered = snapshot.delay, snapshot.lag, snapshot.filtered
     s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
     s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)
+    terms.resume(s.effects.terms, snapshot.terms_memory, elapsed_s)
     if snapshot.temperature_known:
         _copy_pads(s.pads, snapshot.pads)
         s.disc, s.history = snapshot.disc, snapshot.history
