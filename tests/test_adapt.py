@@ -15,7 +15,7 @@ from emb_daemon.adapt import fit as fit_module
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt.adaptation import Adaptation
 from emb_daemon.adapt.files import decode, encode
-from emb_daemon.adapt.fit import _is_excited, fit_training, reach, unexplained_step
+from emb_daemon.adapt.fit import Driven, _is_excited, fit_training, reach, unexplained_step
 from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, curve_values, why_out_of_bounds, with_learned
 from emb_daemon.adapt.memory import FORMAT, Memory, Store, state_directory, with_entry
 from emb_daemon.adapt.pairs import FORCE, MODEL, pairs_of_passes
@@ -773,6 +773,22 @@ def test_the_contact_angle_of_pads_that_did_not_change_is_no_surer_than_torque_a
         assert not found.evidence["curve_changed"]
         off.append((found.contact_angle - ideal["clearance"]) / found.contact_sigma)
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.7
+
+
+def test_other_pads_are_as_stiff_as_what_stops_had_shown_of_the_motor_says(ideal):
+    """A slow stroke that makes the rotor look heavier, as what sticks at reversals does, says nothing against a motor that
+    many stops have shown. Their errors have a share in common, which it leaves open."""
+    rows = trained_rows(ideal)
+    heavier = believed(moved(IDEAL, {"motor.inertia_kg_m2": 0.93 * IDEAL.motor.inertia_kg_m2}))
+    shown = Driven(0.0, 1.0 / 0.93 - 1.0, 0.013**2, 0.013**2, 0.01**2)
+    alone, told = fit(rows, heavier), fit(rows, heavier, driven=shown)
+    for found in (alone, told):
+        assert found.outcome == r.ACCEPTED and found.evidence["curve_changed"]
+    off = [np.abs(force_error(found, ideal, np.linspace(5.0, 20.0, 16))).max() for found in (alone, told)]
+    assert off[1] < 0.5 * off[0]
+    assert told.values["noise.stiffness_relative"] < 0.8 * alone.values["noise.stiffness_relative"]
+    unsure = Driven(0.0, 0.0, 0.2**2, 0.2**2, 0.0)
+    assert fit(rows, heavier, driven=unsure).values == alone.values, "less than one stroke shows is no more than that"
 
 
 def test_the_scale_that_training_cannot_see_stays_in_sigma(corrected):

@@ -74,7 +74,7 @@ def test_an_accepted_evaluation_alone_puts_values_in_use(adaptation, monkeypatch
         module, "fit_training", lambda *_: Evaluation(outcome, values=dict(values), contact_angle=1.5 + clearance)
     )
     calibration = moved(SHIPPED, {"contact.walk_rad_per_sqrt_s": 0.02})
-    adaptation._evaluate(0, 5, np.zeros(1, r.TRAINING), SHIPPED, calibration, new_state()[0], 1.5, 0.0)
+    adaptation._evaluate(0, 5, np.zeros(1, r.TRAINING), SHIPPED, calibration, new_state()[0], 1.5, 0.0, None)
     corner, generation, evaluation, learned, _ = adaptation._done.get()
     expected = moved(SHIPPED, values | ({CLEARANCE: clearance} if taken else {})) if outcome == r.ACCEPTED else calibration
     assert (corner, generation) == (0, 5) and (CLEARANCE in evaluation.values) == taken

@@ -76,17 +76,21 @@ def test_a_pass_to_and_fro_gives_force_and_friction_without_a_model_of_friction(
 def test_the_cost_is_hubers_and_its_normal_equations_are_its_slope():
     """Squares within 2.5 standard deviations, straight beyond, and what is not known has none."""
     rng = np.random.default_rng(3)
-    jacobian, x, prior = 2.0 * rng.standard_normal((4, 40)), 0.3 * rng.standard_normal(4), np.array([0.0, 2.0, 0.5, 1.0])
+    jacobian, x = 2.0 * rng.standard_normal((4, 40)), 0.3 * rng.standard_normal(4)
+    prior = fit._Prior(
+        np.array([0.0, 0.3, -0.1, 0.0]), np.array([[0, 0, 0, 0], [0, 2, 0.4, 0], [0, 0.4, 0.5, 0], [0, 0, 0, 1.0]])
+    )
+    nothing = fit._Prior(np.zeros(4), np.zeros((4, 4)))
     blocks = rng.standard_normal(40) * np.where(np.arange(40) % 5, 1.0, 6.0)
     blocks[7] = np.nan
 
     def cost(at):
         return fit._cost(blocks + at @ jacobian, at, prior)
 
-    assert fit._cost(np.array([2.5, -1.0, np.nan]), np.zeros(4), prior) == pytest.approx(7.25)
-    assert fit._cost(np.array([4.5]), np.zeros(4), prior) == pytest.approx(2.5 * (9.0 - 2.5))
+    assert fit._cost(np.array([2.5, -1.0, np.nan]), np.zeros(4), nothing) == pytest.approx(7.25)
+    assert fit._cost(np.array([4.5]), np.zeros(4), nothing) == pytest.approx(2.5 * (9.0 - 2.5))
     _, gradient = fit._normal_equations(blocks + x @ jacobian, jacobian)
-    assert 2.0 * (gradient + prior * x) == pytest.approx(approx_fprime(x, cost, 1e-7), rel=1e-4, abs=1e-3)
+    assert 2.0 * (gradient + prior.gradient(x)) == pytest.approx(approx_fprime(x, cost, 1e-7), rel=1e-4, abs=1e-3)
     normal, _ = fit._normal_equations(np.full(40, 0.5), jacobian)
     assert normal == pytest.approx(jacobian @ jacobian.T)
 
@@ -95,14 +99,17 @@ def test_a_fit_ends_at_the_least_cost_and_holds_what_is_not_free():
     """Of a straight problem with a prior: that is solved by one system of equations."""
     rng = np.random.default_rng(4)
     size = fit._CURVE + 1
-    matrix, target, prior = rng.standard_normal((200, size)), 0.1 * rng.standard_normal(200), np.zeros(size)
-    prior[[1, 2]] = 5.0, 20.0
+    matrix, target = rng.standard_normal((200, size)), 0.1 * rng.standard_normal(200)
+    prior = fit._Prior(0.2 * rng.standard_normal(size), np.zeros((size, size)))
+    prior.information[np.ix_([1, 2], [1, 2])] = [[5.0, 3.0], [3.0, 20.0]]
     training = SimpleNamespace(simulate=lambda x: (matrix @ x - target, None, None))
     free, held, begun = np.array([0, 1, 3]), np.array([2, *range(4, size)]), 0.3 * rng.standard_normal(size)
     begun[fit._CURVE] = 0.1
     found = fit._improve(training, begun, np.full(size, 1e-5), prior, free)
     part = matrix[:, free]
-    expected = np.linalg.solve(part.T @ part + np.diag(prior[free]), part.T @ (target - matrix[:, held] @ begun[held]))
+    own, others = prior.information[np.ix_(free, free)], prior.information[np.ix_(free, held)]
+    known = own @ prior.expected[free] - others @ (begun - prior.expected)[held]
+    expected = np.linalg.solve(part.T @ part + own, part.T @ (target - matrix[:, held] @ begun[held]) + known)
     assert found.x[free] == pytest.approx(expected, abs=1e-6) and np.array_equal(found.x[held], begun[held])
     assert 0 < found.iterations < 20 and found.cost == pytest.approx(fit._cost(matrix @ found.x - target, found.x, prior))
     assert not found.covariance[held].any() and not found.covariance[:, held].any()

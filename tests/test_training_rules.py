@@ -6,6 +6,7 @@ import pytest
 
 from emb_daemon.adapt import records as r
 from emb_daemon.adapt import training
+from emb_daemon.adapt.fit import Driven
 from emb_daemon.adapt.learned import LOAD_FRICTION, OFFSET_FRICTION, Evaluation, learned_keys, why_out_of_bounds
 from emb_daemon.adapt.memory import entry_of
 from emb_daemon.calibration.parameters import CLEARANCE, PRESLIDING_ANGLE, value_of
@@ -468,6 +469,28 @@ def test_a_training_knows_how_the_motor_fades_by_what_was_known_before_it(parked
         s["error"][[FADE, HOUSING]], s["winding"], s["housing"] = (fade, housing_fade), winding, 0.2
         training._collect(a, s, np.zeros(1, r.REMEMBERED), rows, m)
     np.testing.assert_allclose(rows["faded"], stops * np.array([-0.5 * 0.1 - 0.2 * 0.2, -0.5 * 0.3 - 0.2 * 0.2]))
+
+
+@pytest.mark.parametrize("stops", [0.0, 1.0])
+def test_a_training_knows_motor_and_rotor_by_what_stops_had_shown_before_it(parked, stops):
+    """Changes by their shares; what pads, motor and rotor have in common no stop shows."""
+    a, m, _, _ = parked
+    a["rows"], s, rows = 0, new_state()[0], np.zeros(2, r.TRAINING)
+    s["stops"], s["common"], both = stops, 0.02**2, np.ix_([GAIN, INERTIA], [GAIN, INERTIA])
+    s["error"][[GAIN, INERTIA]] = 0.01, -0.02
+    s["covariance"][both] = [[1e-4, 3e-5], [3e-5, 4e-4]]
+    torque = s["alternatives"][TORQUE_JUMP]
+    torque["share"], torque["error"][[GAIN, INERTIA]] = 0.25, (0.05, 0.02)
+    torque["covariance"][both] = [[4e-4, -1e-5], [-1e-5, 1e-4]]
+    training._collect(a, s, np.zeros(1, r.REMEMBERED), rows, m)
+    s["error"][GAIN] = 0.3
+    training._collect(a, s, np.zeros(1, r.REMEMBERED), rows, m)
+    driven = Driven.of(a)
+    assert (driven is None) == (stops == 0.0)
+    if driven:
+        mean, within = (0.02, -0.01), [0.75 * 1e-4 + 0.25 * 4e-4, 0.75 * 4e-4 + 0.25 * 1e-4, 0.75 * 3e-5 - 0.25 * 1e-5]
+        apart = 0.25 * 0.75 * 0.04 * 0.04
+        assert driven == pytest.approx((*mean, *(variance + apart + 0.02**2 for variance in within)))
 
 
 def test_a_stroke_is_evaluated_for_a_fixed_time(parked):

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from emb_daemon.adapt import records as r
-from emb_daemon.adapt.fit import compile_fit, fit_training, reach
+from emb_daemon.adapt.fit import Driven, compile_fit, fit_training, reach
 from emb_daemon.adapt.learned import Evaluation, with_learned
 from emb_daemon.adapt.memory import Entry, Memory, Store, entry_of, with_entry
 from emb_daemon.adapt.snapshots import Snapshots
@@ -189,7 +189,7 @@ class Adaptation:
             state["effects"] = self._remembered[corner]
             self._do(self._evaluate, corner, int(adapter["generation"]), rows, self._calibrations[corner],
                      self.in_use(CORNERS[corner]), state, float(adapter["power_on_angle"]),
-                     float(adapter["factor_sigma"]))  # fmt: skip
+                     float(adapter["factor_sigma"]), Driven.of(adapter))  # fmt: skip
 
     def _keep_snapshot(self, corner: int, state: np.void, parameters: np.void) -> None:
         if corner not in self._on_page:
@@ -256,9 +256,9 @@ class Adaptation:
 
     def _evaluate(
         self, corner: int, generation: int, rows: np.ndarray, base: Calibration, calibration: Calibration, state: np.void,
-        power_on_angle: float, factor_sigma: float,
+        power_on_angle: float, factor_sigma: float, driven: Driven | None,
     ) -> None:  # fmt: skip
-        evaluation = fit_training(rows, calibration, base, state, factor_sigma)
+        evaluation = fit_training(rows, calibration, base, state, factor_sigma, driven)
         # After a restart the clearance gives the contact angle. If the motor did not start released, the clearance is not
         # changed.
         clearance = evaluation.contact_angle - power_on_angle

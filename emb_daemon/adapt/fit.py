@@ -6,8 +6,9 @@ calibration.
 
 An offset of the torque and the torque constant are fitted as well, but not learned, because they belong to the current sensor
 and the magnets and not to the pads. Motor current alone cannot distinguish a stronger motor from softer pads. The inertia can,
-because it never changes, if the unit is the one that was calibrated. If the pads have changed too, the unit may be another:
-the torque constant is then put halfway between both explanations, with a standard deviation that covers both.
+because it never changes, if the unit is the one that was calibrated. If the pads have changed too, the unit may be another.
+What stops have shown of torque constant and inertia then counts for more than one slow stroke; without any stop the torque
+constant is put halfway between both explanations, with a standard deviation that covers both.
 
 Thesis 2.4 and 3.4 use pairs of passes at equal angle instead. Here they start and check the fit, which also uses the samples
 in between, models the pads' dynamics, and gives a covariance.
@@ -16,7 +17,7 @@ Only the paths are compiled. A fit runs once per training, outside of the loop, 
 take far longer than running them.
 """
 
-from math import exp, expm1, hypot, log, sqrt
+from math import exp, expm1, hypot, log, log1p, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -121,6 +122,22 @@ def reach(rows: np.ndarray, state: np.void, contact_angle: float, learned: np.vo
     return reached[0]
 
 
+class Driven(NamedTuple):
+    """What driving had shown before a training of torque constant and inertia, as shares of the calibration's: errors, their
+    variances and their covariance."""
+
+    gain: float
+    inertia: float
+    gain_variance: float
+    inertia_variance: float
+    covariance: float = 0.0
+
+    @classmethod
+    def of(cls, adapter: np.void) -> "Driven | None":
+        """That of an ADAPTER; None if it had not seen a stop."""
+        return cls(*(float(adapter[name]) for name in r.DRIVEN)) if adapter["driven"] else None
+
+
 class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
     torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
@@ -196,10 +213,23 @@ def compile_fit(calibration: Calibration, state: np.void) -> None:
     characteristic_curve(0.0, p["curve"])
 
 
+class _Prior(NamedTuple):
+    """What is expected of the fitted values, shape (n,), and with what information, (n, n)."""
+
+    expected: np.ndarray
+    information: np.ndarray
+
+    def cost(self, x):
+        return (x - self.expected) @ self.gradient(x)
+
+    def gradient(self, x):
+        return self.information @ (x - self.expected)
+
+
 def _cost(blocks, x, prior):
-    """Huber cost of the finite blocks, plus the cost of ``x`` by ``prior`` (information)."""
+    """Huber cost of the finite blocks, plus that of ``x`` by the `_Prior`."""
     size = np.abs(blocks[np.isfinite(blocks)])
-    return np.where(size < _HUBER, size * size, _HUBER * (2.0 * size - _HUBER)).sum() + prior @ (x * x)
+    return np.where(size < _HUBER, size * size, _HUBER * (2.0 * size - _HUBER)).sum() + prior.cost(x)
 
 
 def _normal_equations(blocks, jacobian):
@@ -211,8 +241,7 @@ def _normal_equations(blocks, jacobian):
 
 
 def _improve(training, x, steps, prior, free):
-    """Levenberg-Marquardt from ``x`` in the values ``free`` (indices), with difference quotients over ``steps`` and ``prior``
-    information on each value, zero being expected.
+    """Levenberg-Marquardt from ``x`` in the values ``free`` (indices), with difference quotients over ``steps`` and ``prior``.
 
     Returns a `_Fit`; -1 iterations if it did not converge."""
     best = training.simulate(x)
@@ -221,8 +250,8 @@ def _improve(training, x, steps, prior, free):
     for count in range(1, _ITERATIONS + 1):
         moves = [training.simulate(x + step)[0] for step in np.diag(steps)[free]]
         normal, gradient = _normal_equations(best[0], (moves - best[0]) / steps[free, np.newaxis])
-        normal += np.diag(prior[free])
-        gradient += (prior * x)[free]
+        normal += prior.information[np.ix_(free, free)]
+        gradient += prior.gradient(x)[free]
         before = cost
         while damping < 1e10:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
@@ -269,16 +298,22 @@ class _Fit(NamedTuple):
     contact_sigma: float
 
 
-def _fit(training, x, steps, free, gain_sigma=_GAIN_SIGMA, inertia_sigma=_INERTIA_SIGMA):
-    """`_improve` twice. The second round weighs correlated blocks and the prior against each other by the first round's
-    correlation, and leaves outliers out."""
-    prior = np.zeros(len(x))
-    prior[_GAIN], prior[_INERTIA] = gain_sigma**-2, inertia_sigma**-2
+#: What is known of motor and rotor beside a training, without any stop.
+_UNDRIVEN = Driven(0.0, 0.0, _GAIN_SIGMA**2, _INERTIA_SIGMA**2)
+
+
+def _fit(training, x, steps, free, known=_UNDRIVEN):
+    """`_improve` twice. The second round weighs correlated blocks and what is ``known`` (`Driven`) against each other by the
+    first round's correlation, and leaves outliers out."""
+    prior, own = _Prior(np.zeros(len(x)), np.zeros((len(x), len(x)))), [_GAIN, _INERTIA]
+    prior.expected[own] = log1p(known.gain), log1p(known.inertia)
+    both = np.array([[known.gain_variance, known.covariance], [known.covariance, known.inertia_variance]])
+    prior.information[np.ix_(own, own)] = np.linalg.inv(both)
     first = _improve(training, x, steps, prior, free)
     far = np.abs(first.blocks) > _FAR * _deviation(first.blocks)
     if np.mean(far) <= _FEW:
         training.left_out |= far
-    return _improve(training, first.x, steps, first.spread * prior, free)
+    return _improve(training, first.x, steps, prior._replace(information=first.spread * prior.information), free)
 
 
 def _guess(highest, pairs, now, terms):
@@ -292,9 +327,9 @@ def _guess(highest, pairs, now, terms):
     return np.array([contact, 0.0, 0.0, *friction, 0.0, *start / scale]), scale
 
 
-def _fit_with_and_without_curve(training, x, curve, offset_friction):
+def _fit_with_and_without_curve(training, x, curve, offset_friction, driven):
     """(`_Fit`, whether the pads are unchanged). Unchanged pads keep the ``curve`` of the campaign (in the fit's units), even
-    if a curve with more freedom fits the noise better."""
+    if a curve with more freedom fits the noise better. ``driven``: `Driven` or None."""
     steps = np.full(len(x), 1e-4)
     steps[_CONTACT], steps[_PRESLIDING], steps[_OFFSET] = 1e-3, 1e-2, 1e-3 * max(offset_friction, 1e-4)
     with_curve, without = np.delete(np.arange(len(x)), _INERTIA), np.delete(np.arange(_CURVE), _INERTIA)
@@ -306,18 +341,19 @@ def _fit_with_and_without_curve(training, x, curve, offset_friction):
         free = _fit(training, held.x, steps, with_curve)
     if _as_good(training, held, free):
         # The inertia distinguishes torque constant and stiffness only as well as it is known itself.
-        return _fit(training, held.x, steps, np.arange(_CURVE), inertia_sigma=INERTIA_SIGMA), True
+        return _fit(training, held.x, steps, np.arange(_CURVE), _UNDRIVEN._replace(inertia_variance=INERTIA_SIGMA**2)), True
     # An inertia that differs from the calibration makes motor and pads look stronger by the same share.
     kept = np.concatenate([free.x[:_CURVE], curve])
     kept[_GAIN] = 0.0
-    held = _fit(training, kept, steps, np.arange(_CURVE), _GAIN_KEPT_SIGMA)
+    held = _fit(training, kept, steps, np.arange(_CURVE), _UNDRIVEN._replace(gain_variance=_GAIN_KEPT_SIGMA**2))
     if _as_good(training, held, free):
         return held, True
     # Either the magnets have lost strength or the rotor is another unit's. The contradiction between inertia and torque
     # constant may be an error of either; its size gives the standard deviation of both (the most likely one of two values, by
     # their difference).
     apart = max(abs(free.x[_GAIN]) / sqrt(2.0), _GAIN_KEPT_SIGMA)
-    return _fit(training, free.x, steps, np.arange(len(x)), apart, apart), False
+    known = driven if driven and driven.gain_variance < apart**2 else Driven(0.0, 0.0, apart**2, apart**2)
+    return _fit(training, free.x, steps, np.arange(len(x)), known), False
 
 
 def _as_good(training, held, fit):
@@ -389,7 +425,12 @@ def _is_excited(angle, contact_angle, force, residual, low, high, limits):
 
 
 def fit_training(
-    rows: np.ndarray, calibration: Calibration, base: Calibration, state: np.void, factor_sigma: float = 0.0
+    rows: np.ndarray,
+    calibration: Calibration,
+    base: Calibration,
+    state: np.void,
+    factor_sigma: float = 0.0,
+    driven: Driven | None = None,
 ) -> Evaluation:
     """Evaluate one training.
 
@@ -398,6 +439,7 @@ def fit_training(
         calibration, base: the one in use until now, and the one of the file.
         state: STATE record, the estimator's at the end of the training, with what its effects remembered at the beginning.
         factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
+        driven: what stops had shown before.
 
     Returns:
         `Evaluation`; its ``outcome`` says whether it may be used.
@@ -415,7 +457,7 @@ def fit_training(
     known = _BLOCK * int(np.isfinite(training.simulate(x)[0]).sum())
     if known < _LEAST_SAMPLES:
         return Evaluation(r.TOO_FEW, evidence={"samples": known})
-    fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"])
+    fit, unchanged = _fit_with_and_without_curve(training, x, now["curve"][:terms] / scale, now["offset_friction"], driven)
     x, sigmas = fit.x, np.sqrt(np.diag(fit.covariance))
     values, of_curve = _learned_values(training, fit, unchanged, base, highest - x[_CONTACT], factor_sigma)
     found = Evaluation(

@@ -49,17 +49,22 @@ LIMITS = np.dtype(
 #: Results of an `Evaluation` that the tick gets in addition to PARAMETERS.
 FOUND = ("contact_angle", "contact_sigma", "torque_error", "torque_error_sigma", "inertia_error", "inertia_sigma")
 
+#: What driving had shown of torque constant and inertia before a training, as shares of the calibration's: errors, their
+#: variances and their covariance.
+DRIVEN = ("driven_gain", "driven_inertia", "driven_gain_variance", "driven_inertia_variance", "driven_covariance")
+
 #: State of one corner's adaptation. ``evaluation_wanted`` requests an evaluation of the first ``training_rows`` of ``rows``;
 #: ``generation`` identifies it. ``evaluation_ready``: the result is there, that is its outcome and, if it was accepted, what
 #: it `FOUND` (the contact angle's standard deviation is for the learned curve). ``ended`` requests that the outcome is logged
 #: and stored. ``force``: that of the torque path without the torque's offset, smoothed. ``holding``: whether the corner
-#: certainly clamps with its parking force at ``time_ns``. ``rewinds``: see STATE, at the last estimate. ``pulse``: count of
+#: certainly clamps with its parking force at ``time_ns``. ``rewinds``: see STATE, at the last estimate. ``driven``: whether
+#: a stop had been seen before the training. ``pulse``: count of
 #: the wheel's pulses when the car came to a stand. ``snapshot_wanted`` requests a snapshot of the estimator; the last one was
 #: at ``snapshot_ns``.
 ADAPTER = np.dtype(
     [
         *fields("i8", "phase result outcome"),
-        *fields("?", "asked tried started was_low was_high"),
+        *fields("?", "asked tried started was_low was_high driven"),
         *fields("f8", "power_on_angle parked_time phase_time still_time still_angle tail_time force pulse fade housing_fade"),
         ("parked", "?"),
         ("snapshot_ns", "i8"),
@@ -67,7 +72,7 @@ ADAPTER = np.dtype(
         *fields("i8", "rows training_rows generation rewinds"),
         *fields("?", "evaluation_wanted evaluation_ready"),
         ("evaluation", "i8"),
-        *((name, "f8") for name in FOUND),
+        *((name, "f8") for name in (*DRIVEN, *FOUND)),
         ("ended", "?"),
         *fields("f8", "ambient rise factor_sigma"),
         ("time_ns", "i8"),

@@ -13,7 +13,7 @@ from emb_daemon.adapt import records as r
 from emb_daemon.adapt.fit import unexplained_step
 from emb_daemon.estimator.answer import answer_row, forget_contested
 from emb_daemon.estimator.common import forget_common, weigh_common
-from emb_daemon.estimator.hypotheses import DRIFT, drift_share_odds, jump_odds, open_all, open_changes
+from emb_daemon.estimator.hypotheses import DRIFT, covariance_of, drift_share_odds, expected, jump_odds, open_all, open_changes
 from emb_daemon.estimator.paths import ONE_CYCLE_S
 from emb_daemon.estimator.records import ESTIMATE, PARAMETERS, SAMPLE, STATE
 from emb_daemon.estimator.restart import SNAPSHOT_S
@@ -119,6 +119,12 @@ def _collect(a, s, remembered, rows, m):
         remembered[0] = s.effects
         # Neither the training nor a start with unknown pads teaches it: other pads may look like a motor that fades.
         a.fade, a.housing_fade = (s.error[FADE], s.error[HOUSING]) if s.stops > 0.0 else (0.0, 0.0)
+        a.driven = s.stops > 0.0
+        a.driven_gain, a.driven_inertia = expected(s, GAIN), expected(s, INERTIA)
+        # A share that pads, motor and rotor have in common no motion shows.
+        a.driven_gain_variance = covariance_of(s, GAIN, GAIN) + s.common
+        a.driven_inertia_variance = covariance_of(s, INERTIA, INERTIA) + s.common
+        a.driven_covariance = covariance_of(s, GAIN, INERTIA) + s.common
     row = rows[a.rows]
     # As the estimator took them: those of a sample that belong to another moment are aligned.
     row.dt, row.angle, row.speed = m.dt, s.angle, s.speed
@@ -204,14 +210,14 @@ def _combine(s, p, moved, variance):
     likeliest = -np.inf
     total = mean = square = 0.0
     for kind in range(3):
-        expected, own, log_odds = _brake_of(s, p, kind)
-        off, both = moved - expected, own + variance
+        mean_of, own, log_odds = _brake_of(s, p, kind)
+        off, both = moved - mean_of, own + variance
         log_odds -= 0.5 * (off * off / both + log(both))
         # Sums are kept relative to the likeliest so far: far apart, the likelihoods are no numbers.
         before = exp(min(likeliest - log_odds, 0.0))
         likeliest = max(likeliest, log_odds)
         odds = exp(log_odds - likeliest)
-        shift = expected + own / both * off
+        shift = mean_of + own / both * off
         total = before * total + odds
         mean = before * mean + odds * shift
         square = before * square + odds * (shift * shift + own * variance / both)

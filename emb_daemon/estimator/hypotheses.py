@@ -638,6 +638,27 @@ def contact_sigma(s: Record) -> float:
 
 
 @njit
+def expected(s: Record, i: int) -> float:
+    """Mean of one state's error over the first hypothesis and all changes; shares as `mix` left them."""
+    mean = s.error[i]
+    for kind in range(DRIFT):
+        a = s.alternatives[kind]
+        mean += a.share * (a.error[i] - s.error[i])
+    return mean
+
+
+@njit
+def covariance_of(s: Record, i: int, j: int) -> float:
+    """Covariance of two states' errors over the same."""
+    at_i, at_j, rest, total = expected(s, i), expected(s, j), 1.0, 0.0
+    for kind in range(DRIFT):
+        a = s.alternatives[kind]
+        rest -= a.share
+        total += a.share * ((a.error[i] - at_i) * (a.error[j] - at_j) + a.covariance[i, j])
+    return total + rest * ((s.error[i] - at_i) * (s.error[j] - at_j) + s.covariance[i, j])
+
+
+@njit
 def _unseen_growth(a):
     """Variance, (rad/K)^2, of the disc's growth, conditional on the contact angle."""
     P = a.covariance
