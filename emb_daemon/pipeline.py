@@ -265,8 +265,7 @@ def _cycles(corner, counter, time_ns):
 
     The Counter gives the number of cycles modulo 15, whatever the delay of the frame. It is used as long as delays of frames
     are made up for by later ones. In a log at a reduced rate the Counter counts frames instead of cycles, and a sender can
-    pause: then the delay stays or grows, and the time of arrival is used until both agree again.
-    """
+    pause: then the delay stays or grows, and the time of arrival is used until both agree again."""
     step = (counter - corner.counter) % COUNTER_MODULO
     if step == 0:
         step = COUNTER_MODULO

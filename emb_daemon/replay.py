@@ -35,8 +35,7 @@ _PAUSE_NS = 1_000_000_000
 class Result:
     """One corner of a replayed log: ESTIMATE and SAMPLE rows, one per resolver sample, and times on the log's own clock.
 
-    Times in ``estimates``, ``samples`` and ``reference`` are on the drive's clock, which continues from log to log.
-    """
+    Times in ``estimates``, ``samples`` and ``reference`` are on the drive's clock, which continues from log to log."""
 
     path: Path
     time_ns: np.ndarray

@@ -31,11 +31,7 @@ _IDLE = 0.1
 
 class _Child:
     """A module of this package in a process of its own, which prints a line when it is ready and one at its end. The last of
-    its arguments is its socket.
-
-    Attributes:
-        ready: ``wall_s`` and ``cpu_s`` from its start to its first line.
-    """
+    its arguments is its socket. ``ready``: ``wall_s`` and ``cpu_s`` from its start to its first line."""
 
     def __init__(self, module: str, *arguments, environment: dict | None = None):
         *words, bus = arguments

@@ -124,14 +124,10 @@ def value_of(calibration: Calibration, key: str) -> float:
 def moved(calibration: Calibration, values: Mapping[str, float], *, checked: bool = False) -> Calibration:
     """The calibration with the numbers at ``values``' keys set, in the keys' units.
 
-    An effect that is switched off is switched on, its amplitudes at zero and its shapes at their usual sizes where
-    ``values`` does not set them. Unless ``checked``, the caller checks bounds and cross-checks, because a fit calls this
-    often.
-
-    Raises:
-        InputError: no number has a key; names near ones.
-        InputErrors: ``checked``, and the result is not what a calibration file may hold; lists every fault.
-    """
+    An effect that is switched off is switched on, its amplitudes at zero and its shapes at their usual sizes where ``values``
+    does not set them. Unless ``checked``, the caller checks bounds and cross-checks, because a fit calls this often. Raises
+    InputError: no number has a key; names near ones. Raises InputErrors: ``checked``, and the result is not what a calibration
+    file may hold; lists every fault."""
     numbers = [float(value) for value in values.values()]
     try:
         changed = _set(calibration, _tree(tuple(values)), numbers) if values else calibration

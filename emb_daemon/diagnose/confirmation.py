@@ -80,8 +80,7 @@ def _left(selection: Selection, judges: Bench | None) -> dict[str, float]:
 def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
     """The selection without everything that makes the running estimator worse.
 
-    Returns it with the errors on left-out episodes.
-    """
+    Returns it with the errors on left-out episodes."""
     bench, recalibrated = selection.model.bench, selection.recalibrated
     before, main, held = errors(bench, bench.calibration), whole(bench), bench.residuals({})
     withdrawn: list[str] = []

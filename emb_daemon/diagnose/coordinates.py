@@ -246,12 +246,9 @@ def effect_coordinates(
 
 @lru_cache(256)
 def _moves(coordinates: tuple[Coordinate, ...], log: int | None) -> tuple[dict[str, int], np.ndarray, np.ndarray]:
-    """How keys follow coordinates on a log, or on all.
-
-    Returns:
-        (position of each key; positions of key and coordinate, and weight, of each move, shape (3, moves); number of
-        coordinates of single logs, lowest and highest of each key, shape (3, keys)).
-    """
+    """How keys follow coordinates on a log, or on all. Returns (position of each key; positions of key and coordinate, and
+    weight, of each move, shape (3, moves); number of coordinates of single logs, lowest and highest of each key, shape (3,
+    keys))."""
     places: dict[str, int] = {}
     moves, limits = [], {}
     for column, coordinate in enumerate(coordinates):
@@ -287,8 +284,7 @@ def about_middle(values: Values, middle: float) -> dict[Coordinate, float]:
     """Values as the calibration states them, with its harmonics as they are fitted.
 
     The motor angle counts from anywhere, so a small change of an order would turn the phase by much. Fits therefore move
-    cosine and sine over the angle from the ``middle`` of those that occur.
-    """
+    cosine and sine over the angle from the ``middle`` of those that occur."""
     result, named = dict(values), {c.name: c for c in values}
     for order, cosine, sine, _ in _HARMONICS:
         if order in named:

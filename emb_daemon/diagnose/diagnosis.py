@@ -165,11 +165,8 @@ def diagnose(
     """Find what the calibration's models lack on ``fit_logs``, add it, and judge on ``validate``.
 
     Validation logs fit nothing, but have a veto, and a say where left-out episodes are asked whether the force got worse.
-    Without them the fit logs judge: each quarter of their episodes by parameters from the other three.
-
-    Raises:
-        InputError: the logs cannot tell anything (too short, no motion, no signal to judge by), or judge themselves.
-    """
+    Without them the fit logs judge: each quarter of their episodes by parameters from the other three. Raises InputError: the
+    logs cannot tell anything (too short, no motion, no signal to judge by), or judge themselves."""
     begin = time.monotonic()
     _refuse_same(fit_logs, validate)
     progress("cutting the logs into episodes", 0.02)

@@ -89,11 +89,7 @@ def find_slope_directions(
 
     For example, a torque constant that changes with the ambient temperature has the same force as a constant fade of the
     torque constant with temperature. If both were free, they would cancel each other with hundreds of newtons each, and
-    explain the misfit of a model.
-
-    Args:
-        covariates: of each unit's drives.
-    """
+    explain the misfit of a model. ``covariates``: of each unit's drives."""
     basis, remaining, square = directions.basis, 0.0, 0.0
     for scores, covariate in zip(units, covariates, strict=True):
         information = np.array([basis.T @ score.products[:-1, :-1] @ basis for score in scores])
@@ -112,8 +108,7 @@ def fit_unit(scores: Sequence[Score], directions: Directions, covariates: np.nda
 
     Of each covariate only the directions in ``free`` are not zero, see `find_slope_directions`. A ridge of `_RIDGE` draws
     directions to zero about which the drives contain little information. The covariance is that of drives, not of samples: the
-    sandwich estimator (White, Econometrica 48, 1980) over each drive's contribution to the equations at the solution.
-    """
+    sandwich estimator (White, Econometrica 48, 1980) over each drive's contribution to the equations at the solution."""
     from scipy.linalg import block_diag
 
     basis, (drives, count) = directions.basis, covariates.shape

@@ -103,11 +103,8 @@ class _Bench(Bench):
 
 
 class Scorer:
-    """The causes under one calibration, and the computation of scores for them.
-
-    Attributes:
-        causes: in the order of a score's columns.
-    """
+    """The causes under one calibration, and the computation of scores for them. ``causes``: in the order of a score's
+    columns."""
 
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
@@ -173,8 +170,7 @@ class Scorer:
 def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict[str, str]:
     """Compute and store the scores of every drive of one unit's corner; returns why some cannot be used, by digest.
 
-    ``resume``: keep existing scores made by the same (`made_by`).
-    """
+    ``resume``: keep existing scores made by the same (`made_by`)."""
     scorer, path = Scorer(calibration), scores_path(root, drives[0].unit, drives[0].corner)
     known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
     scores = {score.drive: score for score in known if score.drive in drives}

@@ -191,8 +191,7 @@ def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, sl
 def errors_left_out(groups: list[Pads], every: DynamicsFit, fit: Callable[[list[Pads]], DynamicsFit]) -> list[Errors]:
     """Errors on every log, of a ``fit`` to all others where its pads have another one, and else of that to ``every`` log.
 
-    The contact of a log is its own, and found in it; how unsure it is has a standard deviation of its own.
-    """
+    The contact of a log is its own, and found in it; how unsure it is has a standard deviation of its own."""
     found = []
     for g, (pads, curve) in enumerate(zip(groups, every.curves, strict=True)):
         for number, (log, clearance) in enumerate(zip(pads.logs, curve.clearances_rad, strict=True)):
@@ -272,11 +271,8 @@ def _past_contact(log: Log, calibration: Calibration) -> np.ndarray:
 
 
 def regress_free(log: Log, x: np.ndarray) -> tuple[np.ndarray, float]:
-    """Thesis 3-5: F(i) = a3 x^3 + a2 x^2 + a1 x + a0 F(i-1) by least squares, ``x`` rad past contact at each sample.
-
-    Returns:
-        (coefficients of the static curve, time constant in s).
-    """
+    """Thesis 3-5: F(i) = a3 x^3 + a2 x^2 + a1 x + a0 F(i-1) by least squares, ``x`` rad past contact at each sample. Returns
+    (coefficients of the static curve, time constant in s)."""
     force = log.force_N
     rows = np.flatnonzero(np.isfinite(force[1:]) & np.isfinite(force[:-1]) & (x[1:] > 0.0)) + 1
     span = max(float(x.max()), 1e-9) ** np.arange(1, TERMS + 1)

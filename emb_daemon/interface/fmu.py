@@ -158,15 +158,8 @@ def _compile(folder: Path, kernels: Path) -> bytes:
 
 
 def make_fmu(calibration: Calibration, kernels: Path) -> bytes:
-    """The FMU's content, for machines like this one.
-
-    Args:
-        kernels: the library that ``emb-daemon compile`` has made.
-
-    Raises:
-        InputError: the library must not be used here.
-        Unavailable: there is no C compiler.
-    """
+    """The FMU's content, for machines like this one. ``kernels``: the library that ``emb-daemon compile`` has made. Raises
+    InputError: the library must not be used here. Raises Unavailable: there is no C compiler."""
     try:
         manifest: Manifest = check(kernels)
     except (Refused, OSError) as refusal:

@@ -90,11 +90,8 @@ def other_current(samples: Records, force_N: np.ndarray, motor: Motor) -> list[s
     """A line if the current of SAMPLE rows is the same share of what the load and of what the acceleration need, and not one.
 
     Other pads or friction change what a load needs, another inertia what acceleration needs; the scale of the current, as an
-    effective value's, changes both, and a torque constant within its tolerances neither by as much.
-
-    Args:
-        force_N: clamp force, (n,); NaN where it is not known.
-    """
+    effective value's, changes both, and a torque constant within its tolerances neither by as much. ``force_N``: clamp force,
+    (n,); NaN where it is not known."""
     speed, current, acceleration, force = _in_motion(samples, force_N)
     if not len(force):
         return []

@@ -295,12 +295,8 @@ class ReferenceBus(PythonCanBus):
 
 def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
     """python-can's bus by its options (`cli.options.bus_options`), or as many as the mapping names channels; for CAN FD if the
-    rig's messages are.
-
-    Raises:
-        InputError: no interface is named, or an unknown one, or the mapping has no DBC.
-        Unavailable: it cannot be opened now.
-    """
+    rig's messages are. Raises InputError: no interface is named, or an unknown one, or the mapping has no DBC. Raises
+    Unavailable: it cannot be opened now."""
     mapping.require_frames()
     if mapping.has_fd:
         options = {"fd": True} | options
@@ -313,12 +309,8 @@ def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
 
 
 def open_mapped(options: dict[str, Any], mapping: Mapping, layout: np.ndarray) -> MappedBus:
-    """A bus read through a mapping, for a daemon of a LAYOUT.
-
-    Raises:
-        InputErrors: messages of the rig have ids with which the daemon sends.
-        InputError, Unavailable: as `open_buses`.
-    """
+    """A bus read through a mapping, for a daemon of a LAYOUT. Raises InputErrors: messages of the rig have ids with which the
+    daemon sends. Raises InputError, Unavailable: as `open_buses`."""
     if faults := mapping.taken(layout):
         raise InputErrors(faults)
     return MappedBus(open_buses(options, mapping), mapping)

@@ -104,11 +104,8 @@ class MappingFile(Struct, kw_only=True):
 
 class Source:
     """One foreign signal of a bus (None: the only one), its ``name`` in a DBC ``message`` and ``signal``, and how it becomes
-    ours: ``scale`` and ``offset`` from the rig's ``unit`` to our ``target``, ``span_ns`` None is a sampling period.
-
-    Raises:
-        InputError: the unit cannot become ours.
-    """
+    ours: ``scale`` and ``offset`` from the rig's ``unit`` to our ``target``, ``span_ns`` None is a sampling period. Raises
+    InputError: the unit cannot become ours."""
 
     def __init__(self, mapped: Mapped, unit: str, target: str, span_ns: float | None):
         self.name: str = mapped.signal

@@ -28,8 +28,7 @@ def integral_time(series: list[np.ndarray]) -> float:
     """Correlation time of an error, s: the integral of its autocorrelation up to the first lag at which it counts as zero.
 
     A first-order process with this time constant has the error's spectral density at low frequency, where the filter works; a
-    white part of the error makes it shorter.
-    """
+    white part of the error makes it shorter."""
     covariance = autocorrelation(series, min(_LAGS, min(len(s) for s in series) // 4))
     correlation = covariance / covariance[0]
     gone = np.flatnonzero(correlation < _GONE)

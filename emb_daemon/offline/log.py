@@ -25,8 +25,7 @@ _NEAR_NS = 2_000_000
 class SlowChannels:
     """Messages with a longer period than the motor's, at their own times, with the signal names of dbc/emb.dbc.
 
-    Each holds ``time_ns`` and the message's signals, shape (n,); frames with a wrong CRC are left out.
-    """
+    Each holds ``time_ns`` and the message's signals, shape (n,); frames with a wrong CRC are left out."""
 
     thermocouples: dict[str, np.ndarray]
     wheel_speed: dict[str, np.ndarray]

@@ -95,12 +95,8 @@ def recording(log: Log) -> Recording:
     """Inputs and thermocouples of a log on an even grid.
 
     Motor frames of thermal logs are rare, so that vehicle and thermocouple frames are taken at their own rate: a brake
-    application that ends a second late would heat the disc by degrees.
-
-    Raises:
-        InputError: no wheel speed, force or torque in the log, no temperature of pads or disc, or of pads without their
-            backing plates.
-    """
+    application that ends a second late would heat the disc by degrees. Raises InputError: no wheel speed, force or torque in
+    the log, no temperature of pads or disc, or of pads without their backing plates."""
     reference, slow = log.reference, log.slow
     channels = [(stamps, row) for stamps, depths in (reference.pads["inner"], reference.pads["outer"]) for row in depths]
     channels.append((reference.time_ns, reference.disc_C))

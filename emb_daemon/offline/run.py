@@ -87,8 +87,7 @@ def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarr
 def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
     """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`.
 
-    Arguments as there; ``factor`` of the stiffness has shape (1,) for all rows or (n,).
-    """
+    Arguments as there; ``factor`` of the stiffness has shape (1,) for all rows or (n,)."""
     force = np.empty(len(samples))
     _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, np.zeros(0, PATHS))
     return force
@@ -124,8 +123,7 @@ def _run_step(samples, parameters, states, estimate, out, heat):
 def held(parameters: np.ndarray | np.void) -> np.ndarray:
     """PARAMETERS, shape (1,), with which the step does not learn the contact angle.
 
-    Learning would spread an error of one path over both, and hide a slow effect in a changing contact angle.
-    """
+    Learning would spread an error of one path over both, and hide a slow effect in a changing contact angle."""
     fixed = np.atleast_1d(parameters).copy()
     fixed["clearance_sigma"] = 0.0
     fixed["contact_walk"] = 0.0
@@ -135,8 +133,7 @@ def held(parameters: np.ndarray | np.void) -> np.ndarray:
 def run_step(samples: np.ndarray, parameters: np.ndarray | np.void, heat: np.ndarray = _UNASKED) -> np.ndarray:
     """The whole step from power-on; returns TRACE rows, what `estimate` does not tell. Residuals want `held` parameters.
 
-    Fills ``heat``, as many HEAT rows as samples, if it is given.
-    """
+    Fills ``heat``, as many HEAT rows as samples, if it is given."""
     out = np.zeros(len(samples), TRACE)
     _run_step(samples, np.atleast_1d(parameters), new_state(), np.zeros(1, ESTIMATE), out, heat)
     return out

@@ -45,8 +45,7 @@ class LiveCar:
         """Run until ``stopped()`` or ``seconds`` are over.
 
         ``sent(time_ns, truth)`` is called after each cycle, with its TRUTH rows and the time when it left, 0 if it was lost;
-        ``received(frames)`` is called with the frames received since. Both views are valid during the call only.
-        """
+        ``received(frames)`` is called with the frames received since. Both views are valid during the call only."""
         last = None if seconds is None else round(seconds * 1e9 / CYCLE_NS)
         deadline = time.monotonic_ns()
         while not stopped() and self.ticks != last:

@@ -156,12 +156,8 @@ class PythonCanBus:
 def open_bus(interface: str | None, channel: str | None, ids: list[int], **options: object) -> Bus:
     """Open the bus that the arguments, can.conf and the CAN_* variables name, receiving ``ids`` only.
 
-    SocketCAN goes through `RawCanSocket`, everything else through python-can.
-
-    Raises:
-        InputError: no interface is named, or an unknown one.
-        Unavailable: it cannot be opened now.
-    """
+    SocketCAN goes through `RawCanSocket`, everything else through python-can. Raises InputError: no interface is named, or an
+    unknown one. Raises Unavailable: it cannot be opened now."""
     chosen: dict[str, Any] = {"interface": interface, "channel": channel, **options}
     # python-can, which is slow to import, fills in what is not given.
     if interface != "socketcan" or not channel:

@@ -448,8 +448,7 @@ class Daemon:
 
         A restart would help if a corner gets no estimates, or if its state is not a number. If most ticks are missed, it helps
         where the loop itself has become slow, and costs more than it brings where others take the processor for some seconds:
-        so only if that lasts. It would not help against an interface that is down or gone.
-        """
+        so only if that lasts. It would not help against an interface that is down or gone."""
         met, missed = self.ticks - self._before[0], self.missed - self._before[1]
         silent = self._active & ~self._estimated
         amiss = [

@@ -93,8 +93,7 @@ def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, 
 
     The kernel's stamps are of CLOCK_REALTIME, which can step. ``offset_ns`` converts them to the monotonic clock, and the
     result is limited to between ``earliest_ns`` and now. It is rounded to whole microseconds, as candump logs them, so that a
-    log of the bus gives the same times.
-    """
+    log of the bus gives the same times."""
     drops = np.int64(-1)
     for index in range(count):
         if headers[index].length == 0:

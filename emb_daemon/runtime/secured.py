@@ -58,12 +58,8 @@ class FreshnessFile:
             raise Unavailable(f"{self.path}: not readable: {error.strerror}") from None
 
     def begin_trip(self) -> Freshness:
-        """The stored values, with a trip counter that was never used before.
-
-        Raises:
-            Unavailable: it cannot be stored; messages sent under a counter that is used twice could be played back.
-            InputError: all trip counters are used up.
-        """
+        """The stored values, with a trip counter that was never used before. Raises Unavailable: it cannot be stored; messages
+        sent under a counter that is used twice could be played back. Raises InputError: all trip counters are used up."""
         kept = self.load()
         if kept.trip >= LAST_TRIP:
             raise InputError(f"{self.path}: all trip counters are used up; install new keys and remove this file")
@@ -179,12 +175,8 @@ class SecuredBus:
 
 
 def secure(bus: Bus, setup: Setup, state: Path | None) -> tuple[SecuredBus, set[str]]:
-    """The daemon's end of an authenticated bus, and the corners of which a key is missing.
-
-    Raises:
-        InputError: no state directory, or all trip counters used up.
-        Unavailable: the trip counter cannot be stored.
-    """
+    """The daemon's end of an authenticated bus, and the corners of which a key is missing. Raises InputError: no state
+    directory, or all trip counters used up. Raises Unavailable: the trip counter cannot be stored."""
     if state is None:
         raise InputError(f"{setup.path}: secoc: freshness must survive a restart; expected state_directory as well")
     file = FreshnessFile(state)

@@ -175,11 +175,8 @@ class EstimatesReader:
 
 
 class PresentEstimates:
-    """The newest estimate of each corner, for readers that need no others.
-
-    Attributes:
-        trouble: why there are none; empty if there are.
-    """
+    """The newest estimate of each corner, for readers that need no others. ``trouble``: why there are none; empty if there
+    are."""
 
     def __init__(self, path: Path):
         self._reader = EstimatesReader(path)

@@ -68,8 +68,7 @@ class Link(NamedTuple):
     """The messages that one sender authenticates for one receiver, under a key of their own.
 
     ``name`` is the name of the authentication message and of the key; ``corner`` is empty for the vehicle; ``sets`` are the
-    CAN ids of the messages of each set.
-    """
+    CAN ids of the messages of each set."""
 
     name: str
     corner: str

@@ -37,11 +37,8 @@ _HEADER = struct.Struct("<HH")
 class Udp:
     """XCP on UDP (ASAM MCD-1 XCP, transport layer Ethernet): packets with length and counter, several to a datagram.
 
-    The sender of the last CONNECT is the master; packets of others are ignored.
-
-    Attributes:
-        gone: the master's machine reported that its port is closed.
-    """
+    The sender of the last CONNECT is the master; packets of others are ignored. ``gone``: the master's machine reported that
+    its port is closed."""
 
     layer = ON_UDP
 

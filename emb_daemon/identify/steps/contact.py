@@ -49,8 +49,7 @@ def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> 
 def _walk(stiffness: StiffnessStep) -> float:
     """Random walk of the contact angle, rad per root of a second, from estimates ten seconds apart in the fitted logs.
 
-    It contains the scatter of the estimates, and is therefore rather too large.
-    """
+    It contains the scatter of the estimates, and is therefore rather too large."""
     squares, seconds = 0.0, 0.0
     fit = stiffness.fit
     for pads, curve in zip(stiffness.pads, fit.curves, strict=True):

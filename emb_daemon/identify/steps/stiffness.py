@@ -108,11 +108,7 @@ class StiffnessStep(Step):
 
 
 def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
-    """Curves, dynamics and effects.
-
-    Args:
-        pads: in ascending order of thickness, for each of which ``nominal`` has a curve.
-    """
+    """Curves, dynamics and effects. ``pads``: in ascending order of thickness, for each of which ``nominal`` has a curve."""
     effects = [combination for count in range(len(OPTIONAL) + 1) for combination in combinations(OPTIONAL, count)]
     candidates = [_candidate(pads, nominal, combination) for combination in effects]
     left_out = all(own.random or len(own.logs) > 1 for own in pads)

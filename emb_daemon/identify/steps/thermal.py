@@ -42,12 +42,9 @@ _NEEDED = {
 
 @dataclass(frozen=True)
 class Temperatures:
-    """One log's modelled temperatures and its thermocouples, every half second.
-
-    Attributes:
-        measured, known, unknown: shape (9, n), degC: inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; ``known`` with
-            the brake torque measured, ``unknown`` without it.
-    """
+    """One log's modelled temperatures and its thermocouples, every half second. ``measured``, ``known``, ``unknown``: shape
+    (9, n), degC: inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; ``known`` with the brake torque measured,
+    ``unknown`` without it."""
 
     time_s: np.ndarray
     measured: np.ndarray
@@ -96,12 +93,8 @@ def _attempt(campaign: Campaign, action, *arguments):
 
 
 def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
-    """Thermal section of the calibration.
-
-    Args:
-        cold: what is known without it: softening is identified with its stiffness path, and pads are judged as in a car by the
-            whole estimator, its own clamp force heating them.
-    """
+    """Thermal section of the calibration. ``cold``: what is known without it: softening is identified with its stiffness path,
+    and pads are judged as in a car by the whole estimator, its own clamp force heating them."""
     logs, unseen = _logs(campaign)
     recordings = {name: found for name, log in logs.items() if (found := _attempt(campaign, _fitting, log)) is not None}
     if not recordings:

@@ -35,8 +35,7 @@ class ThicknessStep(Step):
 
         A straight line between neighbours errs by (t - a)(b - t) times half the curvature, which is found by leaving out each
         inner thickness. A single curve is used for all thicknesses; its error is the change of the pads' part of the
-        compliance.
-        """
+        compliance."""
         thicknesses = np.array([curve.thickness_mm for curve in self.curves])
         if len(thicknesses) == 1:
             return _PADS_PART * abs(float(thickness_mm / thicknesses[0]) - 1.0)

@@ -162,8 +162,7 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
     """Instrumental-variable regression, and a one-dimensional search for the presliding angle.
 
     Of the calibration only the gear is used. The datasheet's torque constant and inertia are priors; the presliding angle is
-    not known better than its resolver count. What logs do not excite keeps a wide prior, and a large sigma.
-    """
+    not known better than its resolver count. What logs do not excite keeps a wide prior, and a large sigma."""
     parts = [_Regression(log, calibration) for log in logs]
     nominal, precision = _wide_prior(sheet)
 
