@@ -85,13 +85,8 @@ class Replay:
         state: folder from which learned values are restored and in which adaptation stores them; without one, nothing is
             learned.
         read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
-        start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation always begins
-            with the log, because otherwise the contact angle would be unknown.
-
-    Attributes:
-        corners: those that are estimated; for ``all`` known from the first log on.
-        adaptation: the adaptation, if there is a state folder.
-        notes: a line for each signal of a log with values that the daemon does not use.
+        start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation always
+            begins with the log, because otherwise the contact angle would be unknown.
     """
 
     def __init__(
@@ -109,9 +104,9 @@ class Replay:
         self._memory = Memory(state) if state else None
         self._end_ns: int | None = None
         self._pipeline: Pipeline | None = None
-        self.adaptation: Adaptation | None = None
-        self.corners: tuple[str, ...] = ()
-        self.notes: list[str] = []
+        self.adaptation: Adaptation | None = None  #: the adaptation, if there is a state folder
+        self.corners: tuple[str, ...] = ()  #: those that are estimated; for ``all`` known from the first log on
+        self.notes: list[str] = []  #: a line for each signal of a log with values that the daemon does not use
         if corner != ALL:
             self._build((CORNERS[corner_index(corner)],))
 

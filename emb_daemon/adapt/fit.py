@@ -125,12 +125,8 @@ class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
     torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
     angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
-
-    Args:
-        rows: TRAINING array, the samples in order.
-        calibration: in use until now.
-        state: STATE record, as in `fit_training`.
-    """
+    ``rows``: TRAINING array, the samples in order; ``calibration``: in use until now; ``state``: STATE record, as in
+    `fit_training`."""
 
     def __init__(self, rows, calibration, state, scale):
         self._rows, self.calibration, self._state, self.scale = rows, calibration, state, scale

@@ -73,12 +73,9 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     installed, cyclictest.
 
     ``kernels`` is the library that the daemon uses; empty: it uses numba; None: what it would use by itself. ``share``: file
-    in which it shares its estimates.
-
-    Returns:
-        The figures that `bench.daemon` prints; under ``answers`` those that `bench.car` prints; ``empty_loop``;
-        ``cyclictest``, None where it is missing; and ``ready``: the daemon's start in ``wall_s`` and ``cpu_s``.
-    """
+    in which it shares its estimates. Returns the figures that `bench.daemon` prints; under ``answers`` those that `bench.car`
+    prints; ``empty_loop``; ``cyclictest``, None where it is missing; and ``ready``: the daemon's start in ``wall_s`` and
+    ``cpu_s``."""
     ours, theirs = connected_sockets()
     car = _Child("car", corners, seconds, _CAR_PRIORITY, theirs)
     daemon = None

@@ -49,16 +49,8 @@ class _LastMessages(logging.Handler):
 
 
 class Session:
-    """One demonstration.
-
-    Args:
-        corners: 1 to 4, FL first.
-        seconds: length of the drive.
-
-    Attributes:
-        recorder: truth and broadcasts.
-        daemon, live: the daemon and the car, for their counts.
-    """
+    """One demonstration, a drive of ``seconds`` with 1 to 4 corners, FL first. ``recorder``: truth and broadcasts; ``daemon``,
+    ``live``: the daemon and the car, for their counts."""
 
     def __init__(self, corners: int, seconds: float):
         self.seconds = seconds

@@ -39,21 +39,13 @@ _FORCE_CHANNELS = ("stiffness", "torque")
 
 @dataclass(frozen=True)
 class Cause:
-    """A quantity in which units may differ.
+    """A quantity in which units may differ."""
 
-    Attributes:
-        key: of the calibration.
-        name: the effect's, or the key of a base parameter.
-        shape: value of the effect's shape parameter with which it is tried, or None.
-        unit: unit of the amount; base parameters are in multiples of their size.
-        thermal: whether it acts by a temperature.
-    """
-
-    key: str
-    name: str
-    shape: float | None
-    unit: str
-    thermal: bool
+    key: str  #: of the calibration
+    name: str  #: the effect's, or the key of a base parameter
+    shape: float | None  #: value of the effect's shape parameter with which it is tried, or None
+    unit: str  #: unit of the amount; base parameters are in multiples of their size
+    thermal: bool  #: whether it acts by a temperature
 
     def __str__(self) -> str:
         return self.name if self.shape is None else f"{self.name} ({self.shape:g})"
@@ -61,19 +53,14 @@ class Cause:
 
 @dataclass(frozen=True)
 class Score:
-    """Scores of one drive.
-
-    Attributes:
-        products: second moments of the causes' regressors and, last, of the residual, without the contact angle, shape
-            (causes + 1, causes + 1), in the causes' units and N.
-        loaded: number of samples with the pads in contact.
-        ambient_C: ambient temperature, NaN if unknown.
-    """
+    """Scores of one drive."""
 
     drive: Drive
+    #: Second moments of the causes' regressors and, last, of the residual, without the contact angle, shape (causes + 1,
+    #: causes + 1), in the causes' units and N.
     products: np.ndarray
-    loaded: int
-    ambient_C: float
+    loaded: int  #: number of samples with the pads in contact
+    ambient_C: float  #: ambient temperature, NaN if unknown
 
 
 def is_periodic(effect: Effect) -> bool:

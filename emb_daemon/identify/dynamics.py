@@ -71,22 +71,14 @@ class Pads:
 
 @dataclass(frozen=True)
 class CurveFit:
-    """A characteristic curve past its contact.
-
-    Attributes:
-        coefficients: N/rad^(n+1), shape (TERMS,).
-        covariance: of the coefficients.
-        clearances_rad: of each log, from its first angle to contact.
-        clearance_sigmas_rad: their standard deviations.
-        travel_rad: largest travel past contact.
-    """
+    """A characteristic curve past its contact."""
 
     thickness_mm: float
-    coefficients: np.ndarray
-    covariance: np.ndarray
-    clearances_rad: np.ndarray
-    clearance_sigmas_rad: np.ndarray
-    travel_rad: float
+    coefficients: np.ndarray  #: N/rad^(n+1), shape (TERMS,)
+    covariance: np.ndarray  #: of the coefficients
+    clearances_rad: np.ndarray  #: of each log, from its first angle to contact
+    clearance_sigmas_rad: np.ndarray  #: their standard deviations
+    travel_rad: float  #: largest travel past contact
 
     def curve(self) -> Curve:
         return Curve(pad_thickness_mm=self.thickness_mm, coefficients=tuple(float(c) for c in self.coefficients))
@@ -108,23 +100,14 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class DynamicsFit:
-    """Joint fit over pads of several thicknesses.
+    """Joint fit over pads of several thicknesses."""
 
-    Attributes:
-        calibration: with what was found.
-        delay_s: by which the reference is late.
-        sigmas: of the shared dynamics, by key and for `DELAY`; none where they were held.
-        curves: of the pads that were fitted.
-        residuals: simulated minus reference force, by log path.
-        rms: over all samples fitted, N.
-    """
-
-    calibration: Calibration
-    delay_s: float
-    sigmas: dict[str, float]
-    curves: list[CurveFit]
-    rms: float
-    residuals: dict[str, np.ndarray] = field(repr=False)
+    calibration: Calibration  #: with what was found
+    delay_s: float  #: by which the reference is late
+    sigmas: dict[str, float]  #: of the shared dynamics, by key and for `DELAY`; none where they were held
+    curves: list[CurveFit]  #: of the pads that were fitted
+    rms: float  #: over all samples fitted, N
+    residuals: dict[str, np.ndarray] = field(repr=False)  #: simulated minus reference force, by log path
 
     def value(self, key: str) -> float:
         """One of `sigmas`' keys."""

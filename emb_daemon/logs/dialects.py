@@ -173,7 +173,7 @@ def _of_terminal(line: bytes) -> bytes:
 
 
 def _of_gvret(line: bytes, places: list[int]) -> bytes:
-    """Args: places: the columns of time, id, whether it is extended, bus and length; the bytes follow the length."""
+    """``places``: the columns of time, id, whether it is extended, bus and length; the bytes follow the length."""
     cells = [cell.strip() for cell in line.split(b",")]
     try:
         stamp, can_id, extended, bus, length = (cells[place] for place in places)

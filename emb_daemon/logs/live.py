@@ -193,12 +193,9 @@ def _message(name: str, mapping: Mapping) -> _Message:
 
 
 class MappedBus(PythonCanBus):
-    """A python-can bus of another rig, with the calls of `runtime.bus.PythonCanBus`; what is sent goes out as it is.
-
-    Args:
-        bus: python-can's, without filters; for CAN FD opened with it (`open_buses`).
-        mapping: by the rig's DBC; references are not converted.
-    """
+    """A python-can bus of another rig, with the calls of `runtime.bus.PythonCanBus`; what is sent goes out as it is. ``bus``
+    has no filters, and is opened for CAN FD if the mapping, by the rig's DBC, has any (`open_buses`); references are not
+    converted."""
 
     def __init__(self, bus: PythonCan, mapping: Mapping):
         super().__init__(bus, [])

@@ -52,32 +52,26 @@ _USUAL_S, _OF_TIME = 5e-4, ("s", "ms", "us", "ns", "d")
 
 
 class Mapping:
-    """A mapping file, checked against both descriptions.
-
-    Attributes:
-        databases: the rig's (cantools) by bus, None the name of the only one; empty of tables and measurements.
-        channels: by bus, as the log names it; None is any.
-        messages: sources by message and signal of ours, a number where it is a constant; a signal that another stands in for
-            is not among them.
-        notes: a line for each signal that the rig does not measure and that others stand in for.
-
-    Raises:
-        InputErrors: every fault of the file: unknown signals of either DBC, units that do not fit, signals left out.
-    """
+    """A mapping file, checked against both descriptions. Raises InputErrors: every fault of the file: unknown signals of
+    either DBC, units that do not fit, signals left out."""
 
     def __init__(self, path: str | Path):
         self.path: Path = Path(path)
         self._file = load_yaml(self.path, MappingFile)
         buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
+        #: The rig's (cantools) by bus, None the name of the only one; empty of tables and measurements.
         self.databases: dict[str | None, Database] = {
             name: load_foreign(self.path.parent / bus.dbc) for name, bus in buses.items()
         }
+        #: By bus, as the log names it; None is any.
         self.channels: dict[str | None, str | None] = {
             name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()
         }
         self._ours = our_messages()
         self._faults: list[str] = []
-        self.notes: list[str] = []
+        self.notes: list[str] = []  #: a line for each signal that the rig does not measure and that others stand in for
+        #: Sources by message and signal of ours, a number where it is a constant; a signal that another stands in for is not
+        #: among them.
         self.messages: dict[str, dict[str, Source | float]] = {}
         for name, mapped in self._file.signals.items():
             self._add(name, mapped)

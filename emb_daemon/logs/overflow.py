@@ -24,13 +24,8 @@ def overflown(current: Series, speed: Series, force: Series | float) -> np.ndarr
 
     Stretches between two steps from one end of the range to the other are held against what load, friction and acceleration
     need: they are overflown if nearer to it from beyond the end, and most of those clearly. Beside one the values at the ends
-    themselves are taken for more, too.
-
-    Args:
-        current: the recorded one.
-        speed: the motor's.
-        force: its load, or a constant one.
-    """
+    themselves are taken for more, too. ``force``: the motor's load, or a
+    constant one."""
     values, steps = current.values, np.diff(current.values)
     nothing = np.zeros(len(values), bool)
     whole = float(np.ptp(values)) if len(values) >= LEAST else 0.0

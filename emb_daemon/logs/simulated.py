@@ -48,16 +48,9 @@ def _bounds(signal) -> tuple[float, float]:
 
 
 class SimulatedRig(PythonCanBus):
-    """A bus that sends our frames as the rig's messages.
-
-    Args:
-        bus: python-can's, opened for CAN FD where the rig's messages need it.
-        mapping: by the rig's DBC.
-        ids: of the frames to receive, unchanged.
-
-    Raises:
-        InputError: a mapping of tables has no frames, and one signal cannot select what else its message holds.
-    """
+    """A bus that sends our frames as the rig's messages, on python-can's, opened for CAN FD where these need it, and receives
+    frames of ``ids`` unchanged. Raises InputError: a mapping of
+    tables has no frames, and one signal cannot select what else its message holds."""
 
     def __init__(self, bus: PythonCan, mapping: Mapping, ids: list[int]):
         super().__init__(bus, ids)

@@ -38,12 +38,8 @@ def _forces(current: dict) -> list:
 
 
 class Web:
-    """Serves one page, its events and metrics, to this machine only.
-
-    Args:
-        port: 0 for any that is free; it is then the attribute `port`.
-        title: name of the bus on the page.
-    """
+    """Serves one page, its events and metrics, to this machine only. Port 0 is any that is free; it is then the attribute
+    `port`. ``title``: name of the bus on the page."""
 
     def __init__(self, port: int, title: str):
         """Raises Unavailable if the port is taken."""

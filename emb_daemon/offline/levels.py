@@ -58,12 +58,8 @@ def lasting_share(pairs: Iterable[tuple[np.ndarray, np.ndarray]], largest: float
     constant is subtracted.
 
     Both halves of a manoeuvre have the same lasting error and independent noise, so that the mean product of their errors is
-    its variance.
-
-    Args:
-        pairs: error and load of gap-free series, one value for each cycle, in the same unit.
-        largest: the load of the largest force.
-    """
+    its variance. ``pairs``: error and load of gap-free series, one value for each cycle, in the same unit; ``largest``: the
+    load of the largest force."""
     products = []
     for error, load in pairs:
         count = len(load) // _MANOEUVRE

@@ -32,30 +32,20 @@ _COARSE_S = 0.5
 class Recording:
     """What heats and cools the pads, on an even grid, and what was measured in them.
 
-    Arrays have shape (n,) unless stated; temperatures in degC. Means hold for the step that starts at their row.
-
-    Attributes:
-        step_s: grid.
-        inner, outer: backing plates; the air, where nothing of the pads was measured.
-        power: mean friction power, W, from the brake torque sensor.
-        touching: pads press on the disc.
-        speed: mean wheel speed, rad/s.
-        force: mean reference clamp force, N.
-        measured: shape (9, n): inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; NaN where there is none.
-        dense: force and torque were recorded often enough for a friction coefficient at each row.
-    """
+    Arrays have shape (n,) unless stated; temperatures in degC. Means hold for the step that starts at their row."""
 
     name: str
-    step_s: float
+    step_s: float  #: grid
+    #: ``inner`` and ``outer``: backing plates; the air, where nothing of the pads was measured.
     inner: np.ndarray
     outer: np.ndarray
     ambient: np.ndarray
-    power: np.ndarray
-    touching: np.ndarray
-    speed: np.ndarray
-    force: np.ndarray
-    measured: np.ndarray
-    dense: bool
+    power: np.ndarray  #: mean friction power, W, from the brake torque sensor
+    touching: np.ndarray  #: pads press on the disc
+    speed: np.ndarray  #: mean wheel speed, rad/s
+    force: np.ndarray  #: mean reference clamp force, N
+    measured: np.ndarray  #: shape (9, n): inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; NaN where there is none
+    dense: bool  #: force and torque were recorded often enough for a friction coefficient at each row
 
     @property
     def time_s(self) -> np.ndarray:

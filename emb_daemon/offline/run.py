@@ -72,12 +72,8 @@ def _run_paths(samples, factor, parameters, states, force, out):
 
 
 def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarray:
-    """Both force paths of cold pads, the contact angle held; returns PATHS rows.
-
-    Args:
-        samples: SAMPLE rows, shape (n,), or any rows with their fields.
-        parameters: one PARAMETERS record, or an array of shape (1,).
-    """
+    """Both force paths of cold pads, the contact angle held; returns PATHS rows. ``samples``: SAMPLE rows, or
+    any rows with their fields; ``parameters``: one PARAMETERS record, or an array of shape (1,)."""
     force, out = np.empty(len(samples)), np.zeros(len(samples), PATHS)
     _run_paths(samples, _COLD, np.atleast_1d(parameters), np.zeros(1, STATE), force, out)
     out["force"] = force
@@ -145,13 +141,9 @@ def estimate(
     state: np.ndarray | None = None,
     adaptation: Adaptation | None = None,
 ) -> np.ndarray:
-    """The whole step as the daemon runs it; returns ESTIMATE rows.
-
-    Args:
-        parameters: one PARAMETERS record, or an array of one record for each corner or one in all.
-        state: STATE, one or four, carried on if given.
-        adaptation: `adapt.adaptation.Adaptation` that learns meanwhile.
-    """
+    """The whole step as the daemon runs it; returns ESTIMATE rows. ``parameters``: one PARAMETERS record, or an array of one
+    record for each corner or one in all; ``state``: STATE, one or four, carried on if given; ``adaptation``:
+    `adapt.adaptation.Adaptation` that learns meanwhile."""
     estimates = np.zeros(len(samples), ESTIMATE)
     answer_all = adaptation.answer if adaptation else answer
     answer_all(samples, len(samples), new_state() if state is None else state, np.atleast_1d(parameters), estimates)

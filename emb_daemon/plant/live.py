@@ -16,13 +16,9 @@ _LOST_NS = 2 * CYCLE_NS
 
 
 class LiveCar:
-    """Drives a schedule repeatedly, one cycle every 4 ms, and receives the daemon's frames between two cycles.
-
-    Attributes:
-        ticks: cycles run.
-        late: cycles that left more than half a cycle after their time, caused by the machine.
-        lost: cycles whose frames were not sent at all because their time had passed.
-    """
+    """Drives a schedule repeatedly, one cycle every 4 ms, and receives the daemon's frames between two cycles. ``ticks``:
+    cycles run; ``late``: cycles that left more than half a cycle after their time, caused by the machine; ``lost``: cycles
+    whose frames were not sent at all because their time had passed."""
 
     def __init__(self, car: Car, bus: Bus, schedule: Schedule):
         self.car = car

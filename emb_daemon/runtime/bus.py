@@ -24,15 +24,12 @@ _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
 
 
 class Bus(Protocol):
-    """A bus as the loop, the monitor and the workshop's servers use it; details are in `RawCanSocket` and `PythonCanBus`.
+    """A bus as the loop, the monitor and the workshop's servers use it; details are in `RawCanSocket` and `PythonCanBus`."""
 
-    Attributes:
-        dropped, unsent: frames that the receiver had no room for, and that the bus did not accept.
-        down, full: the bus cannot be used now; the last drain may have left frames waiting.
-    """
-
+    #: ``dropped`` and ``unsent``: frames that the receiver had no room for, and that the bus did not accept.
     dropped: int
     unsent: int
+    #: ``down`` and ``full``: the bus cannot be used now; the last drain may have left frames waiting.
     down: bool
     full: bool
 

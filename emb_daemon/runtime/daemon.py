@@ -135,17 +135,8 @@ def _compile_fusion(scratch: Pipeline) -> None:
 
 
 class Daemon:
-    """Estimates of one process on one bus.
-
-    Args:
-        setup: checked configuration.
-        bus: what `runtime.bus.open_bus` or `runtime.rawcan.socket_pair` returns.
-        state: folder for learned values; without one nothing is learned.
-        reader: reads calibrations again at a reload.
-
-    Attributes:
-        ticks, missed: periods run, and periods in which the loop did not wake.
-    """
+    """Estimates of one process on one bus. ``state``: folder for learned values; without one nothing is learned; ``reader``
+    reads calibrations again at a reload."""
 
     def __init__(
         self, setup: Setup, bus: Bus, manager: ServiceManager | None = None, state: Path | None = None,
@@ -158,6 +149,7 @@ class Daemon:
         corners = tuple(setup.configuration.corners)
         self.pipeline: Pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
         self._shared: SharedEstimates | None = None
+        #: ``ticks`` and ``missed``: periods run, and periods in which the loop did not wake.
         self.ticks: int = 0
         self.missed: int = 0
         self._active = sum(1 << CORNERS.index(name) for name in corners)

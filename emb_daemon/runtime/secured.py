@@ -88,17 +88,9 @@ class FreshnessFile:
 
 
 class Authentication:
-    """Both directions of one process.
-
-    Args:
-        received, sent: its links. Messages of a link without a key are refused, or sent without authentication.
-        keys: by the links' names.
-        kept: the process's own trip counter, and the counters received before.
-        file: where these are stored; None when logs are read.
-
-    Attributes:
-        keyless: links without a key.
-    """
+    """Both directions of one process, over its links; messages of a link without a key, all by the links' names, are refused,
+    or sent without authentication. ``kept``: the process's own trip counter, and the counters received before; ``file``: where
+    these are stored; None when logs are read."""
 
     def __init__(
         self,
@@ -108,7 +100,7 @@ class Authentication:
         kept: Freshness,
         file: FreshnessFile | None = None,
     ):
-        self.keyless: list[Link] = [link for link in (*received, *sent) if link.name not in keys]
+        self.keyless: list[Link] = [link for link in (*received, *sent) if link.name not in keys]  #: links without a key
         self._kept, self._file = kept, file
         self._verifier = Verifier(received, keys, kept.heard)
         self.verify: Callable[[np.ndarray], np.ndarray] = self._verifier.verify

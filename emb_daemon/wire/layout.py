@@ -175,11 +175,8 @@ def read_dbc(path: Path) -> str:
 
 
 def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> list[str]:
-    """Make the SIGNAL records of a message take and give ``expected``'s units instead of those of its own DBC.
-
-    Returns:
-        Faults: units that are missing, unknown or of another quantity.
-    """
+    """Make the SIGNAL records of a message take and give ``expected``'s units instead of those of its own DBC; returns faults:
+    units that are missing, unknown or of another quantity."""
     faults = []
     for column, name in zip(columns, names, strict=True):
         unit, target = ((found.get_signal_by_name(name).unit or "").strip() for found in (message, expected))

@@ -21,11 +21,7 @@ def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> 
     """Clearance as the mean of all logs, with the standard deviation with which the next power-on will find it.
 
     A log that begins in contact shows no clearance; if all do, it is the datasheet's, with half of it as standard deviation.
-
-    Args:
-        count_rad: the resolver's smallest step.
-        nominal_rad: the datasheet's clearance.
-    """
+    ``count_rad``: the resolver's smallest step; ``nominal_rad``: the datasheet's clearance."""
     curves = stiffness.fit.curves
     found = np.concatenate([curve.clearances_rad for curve in curves])
     errors = np.concatenate([curve.clearance_sigmas_rad for curve in curves])

@@ -54,33 +54,27 @@ class Temperatures:
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalStep(Step):
-    """Thermal section.
+    """Thermal section."""
 
-    Attributes:
-        fitted, unseen: recordings that fitted, and logs that validate, by name.
-        hot: logs that fitted in which the brake works as in service: force over heat.
-        terms: of the heat balance, that these logs prove beside it.
-        left_K, follows: RMS that is clearly left of the temperatures nevertheless, and the signal that it follows most.
-        heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
-        figures: RMSE on logs that were not fitted, by name with unit, once `validate`d.
-        achieved_K: the worst of these temperatures; None without one.
-        residuals: the same for what was fitted.
-    """
-
+    #: ``fitted`` and ``unseen``: recordings that fitted, and logs that validate, by name.
     fitted: dict[str, Recording]
     unseen: dict[str, Log] = field(default_factory=dict, repr=False)
+    #: Logs that fitted in which the brake works as in service: force over heat.
     hot: tuple[Log, ...] = field(default=(), repr=False)
-    terms: tuple[Term, ...] = ()
+    terms: tuple[Term, ...] = ()  #: of the heat balance, that these logs prove beside it
+    #: ``left_K`` and ``follows``: RMS that is clearly left of the temperatures nevertheless, and the signal that it follows
+    #: most.
     left_K: float = 0.0
     follows: str = ""
-    heat: Step | None = None
+    heat: Step | None = None  #: pads and disc; None without a log that heats the pads, and everything below is then empty
     law: CoolingLaw | None = None
     friction: FrictionFit | None = None
     softening: SofteningFit | None = None
     temperatures: dict[str, Temperatures] = field(default_factory=dict)
+    #: RMSE on logs that were not fitted, by name with unit, once `validate`d.
     figures: dict[str, float] = field(default_factory=dict)
-    achieved_K: float | None = None
-    residuals: dict[str, float] = field(default_factory=dict)
+    achieved_K: float | None = None  #: the worst of these temperatures; None without one
+    residuals: dict[str, float] = field(default_factory=dict)  #: the same for what was fitted
 
 
 def _attempt(campaign: Campaign, action, *arguments):

@@ -20,12 +20,7 @@ _NEED_CURVE = "slow clamp and release from the released position to a tenth of t
 
 @dataclass(frozen=True, kw_only=True)
 class ThicknessStep(Step):
-    """Curves over pad thickness; nothing of the calibration.
-
-    Attributes:
-        curves: one per thickness.
-        left_out: `left_out_errors`.
-    """
+    """Curves, one per pad thickness, and `left_out_errors`; nothing of the calibration."""
 
     curves: list[CurveFit]
     left_out: np.ndarray
