@@ -228,11 +228,12 @@ class MappedBus(PythonCanBus):
 
     def _sample(self, corner: str, resolver: _Message, time_ns: int) -> list[tuple | None]:
         """A sample of a corner, and the slow messages that are due."""
-        rows = [
-            slow.frame(fill_missing(name, slow.last()), time_ns)
-            for name, slow in self._messages.items()
-            if not name.endswith(("_Resolver", "_Current", "_ForceSensor")) and self._is_due(slow, time_ns)
-        ]
+        rows = []
+        for name, slow in self._messages.items():
+            is_due = time_ns - slow.sent_ns >= _DUE * slow.cycle_ns and slow.fresh(time_ns)
+            if is_due and not name.endswith(("_Resolver", "_Current", "_ForceSensor")):
+                slow.counter += 1
+                rows.append(slow.frame(fill_missing(name, slow.last()), time_ns))
         cycles = max(1, round((time_ns - resolver.sent_ns) / CYCLE_NS)) if resolver.sent_ns else 1
         motion = _motion(resolver, time_ns)
         resolver.counter += cycles
@@ -244,12 +245,6 @@ class MappedBus(PythonCanBus):
                 rows.append(fast.frame(means if kind == "Current" else fast.last(), time_ns))
         rows.append(resolver.frame(motion, time_ns))
         return rows
-
-    def _is_due(self, slow: _Message, time_ns: int) -> bool:
-        if time_ns - slow.sent_ns < _DUE * slow.cycle_ns or not slow.fresh(time_ns):
-            return False
-        slow.counter += 1
-        return True
 
 
 def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:

@@ -37,11 +37,8 @@ class Mapped(Struct, kw_only=True):
     def __post_init__(self) -> None:
         if (self.signal is None) == (self.value is None):
             raise ValueError("expected either signal (of the rig) or value (a constant)")
-        alone = (self.unit, self.bus, self.period, self.mean_ms) == (None, None, None, None) and (self.scale, self.offset) == (
-            1.0,
-            0.0,
-        )
-        if self.value is not None and not alone:
+        others = (self.unit, self.bus, self.period, self.mean_ms, self.scale, self.offset)
+        if self.value is not None and others != (None, None, None, None, 1.0, 0.0):
             raise ValueError("value: stands alone, in our unit")
         if self.scale == 0.0:
             raise ValueError("scale: 0 leaves nothing of the signal")

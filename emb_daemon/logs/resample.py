@@ -70,10 +70,8 @@ HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
 _SLOW_MS = 40
 
-
 #: Signals of one of our messages: where they come from, a constant, or None for an instrument that the rig does not have.
 Signals = Mapping[str, Series | float | None]
-
 
 #: By the last word of a message's name: which of its signals may be missing, and their substitutes.
 SUBSTITUTES = {

@@ -40,17 +40,15 @@ def _bounds(signal) -> tuple[float, float]:
     """Range of a cantools signal."""
     if signal.is_float:
         return -np.inf, np.inf
-    least, most = (
-        (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
-    )
-    ends = least * signal.scale + signal.offset, most * signal.scale + signal.offset
+    least = -(1 << signal.length - 1) if signal.is_signed else 0
+    ends = [raw * signal.scale + signal.offset for raw in (least, least + (1 << signal.length) - 1)]
     return min(ends), max(ends)
 
 
 class SimulatedRig(PythonCanBus):
     """A bus that sends our frames as the rig's messages, on python-can's, opened for CAN FD where these need it, and receives
-    frames of ``ids`` unchanged. Raises InputError: a mapping of
-    tables has no frames, and one signal cannot select what else its message holds."""
+    frames of ``ids`` unchanged. Raises InputError: a mapping of tables has no frames, and one signal cannot select what else
+    its message holds."""
 
     def __init__(self, bus: PythonCan, mapping: Mapping, ids: list[int]):
         super().__init__(bus, ids)
