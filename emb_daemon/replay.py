@@ -79,7 +79,6 @@ class Replay:
     """A drive made of logs.
 
     Args:
-        calibration: of the corners' actuators.
         corner: FL, FR, RL, RR, or ``all`` for every corner in the first log.
         measured_torque: use the rig's brake torque sensor for the heat model instead of the estimated force.
         state: folder from which learned values are restored and in which adaptation stores them; without one, nothing is

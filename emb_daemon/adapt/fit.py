@@ -387,17 +387,11 @@ def _is_excited(angle, contact_angle, force, residual, low, high, limits):
 def fit_training(
     rows: np.ndarray, calibration: Calibration, base: Calibration, state: np.void, factor_sigma: float = 0.0
 ) -> Evaluation:
-    """Evaluate one training.
+    """Evaluate one training; the result's ``outcome`` says whether it may be used.
 
-    Args:
-        rows: TRAINING array, the samples in order.
-        calibration, base: the one in use until now, and the one of the file.
-        state: STATE record, the estimator's at the end of the training, with what its effects remembered at the beginning.
-        factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
-
-    Returns:
-        `Evaluation`; its ``outcome`` says whether it may be used.
-    """
+    ``rows``: TRAINING array, the samples in order; ``calibration`` is in use until now, ``base`` that of the file; ``state``:
+    STATE record, the estimator's at the end of the training, with what its effects remembered at the beginning;
+    ``factor_sigma``: standard deviation of the rows' stiffness factor, as a share of it."""
     now, limits = to_parameters(calibration), calibration.adaptation
     if len(rows) < _LEAST_SAMPLES:
         return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})

@@ -134,11 +134,8 @@ def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K
     """RMS of a channel's residual that the calibration had on its own data: the worst of its figures on logs that fitted
     nothing, or what its noise makes over these forces, if that is more. NaN where it says neither.
 
-    Args:
-        force_N: clamp forces of the judging logs.
-        rise_K: of their pads and disc since the beginning, measured; NaN where there is none.
-        samples: over which the residual is averaged; of the paths' errors that leaves what their correlation times say.
-    """
+    Forces and ``rise_K`` (of pads and disc since the beginning, measured; NaN where there is none) are of the judging logs.
+    The residual is averaged over ``samples``; of the paths' errors that leaves what their correlation times say."""
     figures = calibration.provenance.achieved if calibration.provenance else {}
     noise, motor = calibration.noise, calibration.motor
     # Without a reference the current is held against the stiffness path: its error comes on top.

@@ -240,14 +240,11 @@ def find_shared_causes(
     against_others: bool,
     misfits: Collection[int] = (),
 ) -> list[Difference]:
-    """Causes that groups of units share, one after the other, the strongest first, until none is significant.
+    """Causes that groups of units (masks, shape (N,)) share, one after the other, the strongest first, until none is
+    significant. Groups are compared with all other units if ``against_others``, otherwise with zero.
 
-    Args:
-        groups: masks of the units, shape (N,).
-        against_others: compare groups with all other units; otherwise with zero.
-        misfits: causes that are subtracted from the units like others, but are no finding; nor is one that has a misfit among
-            its rivals.
-    """
+    ``misfits``: causes that are subtracted from the units like others, but are no finding; nor is one that has a misfit among
+    its rivals."""
     rows, signatures = readings.ordinary, readings.signatures
     chosen: list[tuple[str, int]] = []
     found: list[Difference | None] = []

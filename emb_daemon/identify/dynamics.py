@@ -48,7 +48,6 @@ _LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
 EPISODE = 250
 
-
 #: (error of the stiffness path, reference force) in N on one log, where there is a reference.
 Errors = tuple[np.ndarray, np.ndarray]
 
@@ -409,16 +408,12 @@ def fit_dynamics(
     search: bool = False,
     shared: tuple[str, ...] | None = None,
 ) -> DynamicsFit:
-    """One set of dynamics, a curve for each pair of pads, a contact angle for each log.
+    """One set of dynamics, a curve for each pair of pads, a contact angle for each log. ``start``: dynamics, with the effects
+    that take part, and curves to start from, as ``delay_s`` of the reference.
 
-    Args:
-        start: dynamics, with the effects that take part, and curves to start from.
-        delay_s: of the reference, to start from.
-        fraction: share that is fitted of each log that is not slow, from its beginning.
-        search: try several starting points for angles that shape an effect.
-        shared: which of the dynamics are fitted beside curves and contact angles; all of them and the reference's delay if
-            left out.
-    """
+    ``fraction``: share that is fitted of each log that is not slow, from its beginning; ``search``: try several starting
+    points for angles that shape an effect; ``shared``: which of the dynamics are fitted beside curves and contact angles; all
+    of them and the reference's delay if left out."""
     model = _Model(groups, start, delay_s, fraction, (*dynamics(start), DELAY) if shared is None else shared)
     blocks, first = model.blocks(), model.free
     angles = [key for key in model.shared if key.startswith("effects.") and key.endswith("_rad")]

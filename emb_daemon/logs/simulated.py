@@ -1,11 +1,8 @@
 """The simulated car on another rig's bus: our frames are sent as the rig's messages, by the mapping that reads them."""
 
-from typing import Any
-
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.logs.live import open_buses
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.mapping_file import Source
 from emb_daemon.logs.resample import our_messages
@@ -81,8 +78,3 @@ class SimulatedRig(PythonCanBus):
         for theirs in changed.values():
             if not theirs.missing:
                 self._hand_over(theirs.frame())
-
-
-def open_simulated(options: dict[str, Any], mapping: Mapping, ids: list[int]) -> SimulatedRig:
-    """A bus by python-can's options (`cli.options.bus_options`); errors as in `logs.live.open_buses`."""
-    return SimulatedRig(open_buses(options, mapping), mapping, ids)

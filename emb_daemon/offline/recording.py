@@ -215,17 +215,12 @@ def _advance(s, p, m, longest, inner, outer, ambient):
 def simulate(
     parameters: np.void, r: Recording, torque_known: bool = True, every: int = 1, signals: np.ndarray | None = None
 ) -> np.ndarray:
-    """Temperatures by the estimator's heat chain, with effects and terms, over a recording, every ``every``-th row.
+    """Temperatures (degC, shape (rows, 13): the nine of `Recording.measured`, both pad surfaces, both pad means) by the
+    estimator's heat chain, with effects and terms, over a recording, every ``every``-th row; heated by the brake torque sensor
+    if ``torque_known``, else by the friction table and the reference force.
 
-    Args:
-        parameters: PARAMETERS.
-        torque_known: heat by the brake torque sensor, else by the friction table and the reference force.
-        signals: shape (n, signals), filled with what terms see (`effects.terms.SIGNALS`) at every row; what a recording does
-            not hold is zero or no number.
-
-    Returns:
-        Shape (rows, 13), degC: the nine of `Recording.measured`, both pad surfaces, both pad means.
-    """
+    ``signals``, shape (n, signals), is filled with what terms see (`effects.terms.SIGNALS`) at every row; what a recording
+    does not hold is zero or no number."""
     own, out = np.atleast_1d(parameters), np.empty((-(-len(r.power) // every), 13))
     if signals is None:
         signals = np.zeros((0, len(SIGNALS)))
