@@ -42,7 +42,6 @@ def owner(version: int, corner: str, calibration: Calibration) -> dict[str, str 
 
 
 def encode(content: msgspec.Struct) -> bytes:
-    """A file's bytes."""
     body = msgspec.json.format(msgspec.json.encode(content), indent=1)
     return msgspec.json.encode(_Sealed(hashlib.sha256(body).hexdigest(), msgspec.Raw(body))) + b"\n"
 

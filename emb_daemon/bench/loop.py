@@ -99,6 +99,12 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     return figures | result | {"answers": answers, "cyclictest": latency}
 
 
+def quantiles(us: np.ndarray) -> dict[str, float]:
+    """Median and 99th percentile; NaN of nothing."""
+    median, tail = np.percentile(us, (50, 99)) if len(us) else (np.nan, np.nan)
+    return {"p50_us": float(median), "p99_us": float(tail)}
+
+
 def is_held_up(late_ns: int, worked_ns: int) -> bool:
     """Whether the machine caused a wake-up ``late_ns`` too late, by the CPU time of the whole process meanwhile."""
     return late_ns >= CYCLE_NS and worked_ns < _IDLE * late_ns
@@ -126,16 +132,12 @@ def cyclictest(seconds: float) -> dict[str, float] | None:
         return None
     counts = [line.split() for line in output.splitlines() if line[:1].isdigit()]
     latency = np.repeat([int(us) for us, _ in counts], [int(count) for _, count in counts])
-    if not len(latency):
-        return None
-    return {"p50_us": float(np.median(latency)), "p99_us": float(np.percentile(latency, 99)), "ticks": len(latency)}
+    return quantiles(latency) | {"ticks": len(latency)} if len(latency) else None
 
 
 def machine() -> str:
     """Processor, cores and kernel, for the table's heading."""
-    model = "unknown processor"
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.lower().startswith("model name"):
-            model = line.partition(":")[2].strip()
-            break
-    return f"{model}, {os.cpu_count()} CPUs, Linux {os.uname().release}, CPython {sys.version.split()[0]}"
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    models = (line.partition(":")[2].strip() for line in lines if line.lower().startswith("model name"))
+    model, python = next(models, "unknown processor"), sys.version.split()[0]
+    return f"{model}, {os.cpu_count()} CPUs, Linux {os.uname().release}, CPython {python}"

@@ -131,7 +131,6 @@ def _secure(arguments: argparse.Namespace, read):
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Check the arguments before the work."""
     from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, ending_of
     from emb_daemon.replay import ALL
 

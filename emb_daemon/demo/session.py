@@ -67,7 +67,6 @@ class Session:
         self._failures: list[BaseException] = []
 
     def warm_up(self) -> None:
-        """Compile, or load from the cache."""
         self.daemon.warm_up()
         self.live.warm_up()
         self.recorder.compare(0)
@@ -141,7 +140,6 @@ def _summary(session: Session) -> None:
 
 
 def _run_with_view(session: Session, console: "Console", messages: deque[str]) -> None:
-    """On a terminal."""
     from rich.live import Live
 
     from emb_daemon.demo.view import render

@@ -154,7 +154,6 @@ def _kernel(term: Term) -> list[str]:
 
 
 def _declaration(term: Term, equation: str) -> list[str]:
-    """The kernel's `Effect`."""
     return [
         "EFFECT = Effect(",
         f"    name={_literal(effect_name(term))},",

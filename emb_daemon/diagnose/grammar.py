@@ -309,7 +309,6 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
 
 
 def _place(made: Candidate) -> tuple[str, tuple[str, ...]]:
-    """Port and signals of a term."""
     return made.effect.hook, made.signals
 
 
@@ -517,7 +516,6 @@ def _with_orders_again(selection: Selection, channel: str) -> Selection:
 
 
 def _made(selection: Selection, channel: str) -> list[str]:
-    """Terms that were accepted in a channel."""
     return [name for name, c in selection.candidates.items() if c.accepted and c.made and c.channel == channel]
 
 

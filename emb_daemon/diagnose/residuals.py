@@ -364,7 +364,6 @@ class Bench:
 
     @property
     def sources(self) -> list[str]:
-        """Names of the logs."""
         return [trial.log.path.name for trial in self.trials]
 
     @property
@@ -418,7 +417,6 @@ class Bench:
         return result
 
     def under(self, calibration: Calibration) -> "Bench":
-        """The same logs under another calibration."""
         result = copy.copy(self)
         result.calibration = calibration
         return result

@@ -148,7 +148,6 @@ def _apart(diagnosis: Diagnosis) -> list[str]:
 
 
 def _dead(diagnosis: Diagnosis) -> list[str]:
-    """The current sensor has a dead band."""
     dead_A = diagnosis.bench.current_dead_A
     told = f"The current is either 0 or above {dead_A:.3g} A, a dead band: the torque path is judged where it is above."
     return [told] if dead_A else []

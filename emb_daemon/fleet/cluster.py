@@ -134,7 +134,6 @@ def run(
     done = 0
 
     def submit(rows: Iterable[int]) -> dict[Any, int]:
-        """Rows by the futures of their tasks."""
         return {client.submit(task, items[row], pure=False): row for row in rows}
 
     def settle(row: int, future: Any, final: tuple[type[Exception], ...]) -> None:

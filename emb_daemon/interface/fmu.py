@@ -85,7 +85,6 @@ def _variables(calibration: Calibration) -> list[_Variable]:
 
 
 def _table(variables: list[_Variable], token: str) -> str:
-    """The content of variables.h."""
     starts = ", ".join(
         f".{signal.field} = {'NAN' if isnan(signal.start) else _text(signal.start)}" for signal in INPUTS if signal.start
     )
@@ -98,7 +97,6 @@ def _table(variables: list[_Variable], token: str) -> str:
 
 
 def _description(variables: list[_Variable], token: str, about: str) -> bytes:
-    """The content of modelDescription.xml."""
     root = ElementTree.Element(
         "fmiModelDescription",
         {

@@ -90,7 +90,6 @@ def _of_hdf5(path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _of_tdms(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """LabVIEW's channels, `group.channel`."""
     from nptdms import TdmsFile
 
     for group in TdmsFile.read(io.BytesIO(content)).groups():

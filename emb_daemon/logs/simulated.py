@@ -25,7 +25,6 @@ class _Theirs:
         self.missing.discard(name)
 
     def frame(self):
-        """A python-can Message."""
         import can
 
         data = self.message.encode(self.values, strict=False)

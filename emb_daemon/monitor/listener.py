@@ -211,7 +211,6 @@ class Listener:
         return {corner.name: corner.state(now_ns) for corner in self.active}
 
     def reset(self) -> None:
-        """Forget everything."""
         self.corners: list[Corner] = [Corner(name, self._cycles) for name in CORNERS]
 
     def receive(self, frames: np.ndarray) -> None:

@@ -178,7 +178,6 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
 
 
 def _training(entry: "Entry") -> list:
-    """A row of the table of trainings."""
     figures = (("samples", 1.0, 0), ("residual_ratio", 1.0, 2), ("top_force_N", 1e-3, 1), ("force_sigma_N", 1.0, 0))
     numbers = [(entry.evidence.get(name), factor, digits) for name, factor, digits in figures]
     numbers += [(entry.ambient_C, 1.0, 0), (entry.pad_rise_K, 1.0, 0)]

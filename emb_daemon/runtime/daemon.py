@@ -54,10 +54,6 @@ _SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
 
 
-def _real_time(_time_ns: int) -> int:
-    return time.time_ns()
-
-
 class Pacer:
     """Decides when to wake next, from the arrival times of the samples."""
 
@@ -145,7 +141,9 @@ class Daemon:
         self._setup = setup
         self._bus = bus
         self._manager = manager or ServiceManager(environment={})
-        self._adaptation = Adaptation(setup.calibrations, Memory(state), _real_time, threaded=True) if state else None
+        self._adaptation = None
+        if state:
+            self._adaptation = Adaptation(setup.calibrations, Memory(state), lambda _: time.time_ns(), threaded=True)
         corners = tuple(setup.configuration.corners)
         self.pipeline: Pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
         self._shared: SharedEstimates | None = None

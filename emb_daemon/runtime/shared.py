@@ -101,7 +101,6 @@ class SharedEstimates:
         self._on_page[0] = on_page
 
     def close(self) -> None:
-        """Remove the file."""
         self.path.unlink(missing_ok=True)
 
 

@@ -112,7 +112,6 @@ class Slave:
 
     @property
     def acquiring(self) -> bool:
-        """Whether a list is running."""
         return any(chosen.running for chosen in self._lists)
 
     def answer(self, packet: bytes) -> bytes:
@@ -131,7 +130,6 @@ class Slave:
             return bytes([_ERROR, *refusal.args])
 
     def end(self) -> None:
-        """End the session."""
         self.connected = False
         self._reset()
 

@@ -64,7 +64,6 @@ def _rate(r: Recording) -> tuple[float, float, float] | None:
 
 
 def figure(section: Section, law: CoolingLaw) -> None:
-    """The law in the report."""
     order = np.argsort(law.speed_rad_per_s)
     speed = law.speed_rad_per_s[order]
     rates = [

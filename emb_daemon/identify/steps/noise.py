@@ -295,7 +295,6 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
 
 
 def section(page: Page, calibration: Calibration) -> None:
-    """Noise levels in the report."""
     noise, contact = calibration.noise, calibration.contact
     part = page.section(
         "Noise levels",

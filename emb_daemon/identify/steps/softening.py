@@ -260,7 +260,6 @@ def fit_softening(log: Log, heat: Recording, calibration: Calibration) -> Soften
 
 
 def figure(section: Section, found: SofteningFit) -> None:
-    """Softening in the report."""
     section.heading("Stiffness over temperature and its history")
     hours = found.time_s / 3600.0
     factors = [

@@ -184,7 +184,6 @@ def _choose(candidates: list[Candidate], worth: float) -> Candidate:
 
 
 def section(page: Page, step: StiffnessStep) -> None:
-    """Curves and dynamics in the report."""
     curves = page.section(
         "Characteristic curves",
         "Clamp force over motor angle past contact (thesis 2.1, 2.2). Points: slow clamp and release; line: the static curve "

@@ -228,7 +228,6 @@ def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibra
 
 
 def _note_errors(name: str, error: np.ndarray, into: dict[str, float]) -> None:
-    """RMSE of what was measured."""
     for part, rows in (("pads", error[:8]), ("disc", error[8])):
         if np.isfinite(rows).any():
             into[name.format(part)] = rmse(rows)
@@ -262,7 +261,6 @@ def _notes(heat, law, rubbed, softened) -> tuple[str, ...]:
 
 
 def section(page: Page, step: ThermalStep, calibration: Calibration) -> None:
-    """Heat in the report."""
     part = page.section("Pads and disc: heat")
     if step.heat is None:
         part.text(

@@ -265,7 +265,6 @@ _ROWS = (
 
 
 def section(page: Page, step: TorqueStep) -> None:
-    """Torque balance in the report."""
     part = page.section(
         "Torque balance",
         "Current explained by force, acceleration and friction (thesis 2.4, 4.1, 4.2). The current is noisy and is what is "
