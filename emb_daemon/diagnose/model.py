@@ -113,8 +113,6 @@ class Model:
         residual, heat = self.bench.run(left)
         return replace(self, values=left, residual=residual, heat=heat, chosen=self.chosen - gone)
 
-    # -- fitting ------------------------------------------------------------------------------------------------------
-
     def noise(self, channel: str) -> float:
         """Mean square of the residual where there is one."""
         return rms_known(self.residual[channel]) ** 2
@@ -238,8 +236,6 @@ class Model:
     def _known_to(self, coordinate: Coordinate) -> float:
         centre = self.centre.get(coordinate, coordinate.start)
         return coordinate.known_to(self.values.get(coordinate, centre), centre)
-
-    # -- testing ------------------------------------------------------------------------------------------------------
 
     def penalty(self, coordinates: Sequence[Coordinate], channel: str) -> np.ndarray:
         """What priors add to the normal equations."""

@@ -144,8 +144,6 @@ class Screening:
             return max(noise, _THERMOCOUPLE_K if channel == "temperature" else self.floor(model, channel))
         return achieved(self.bench.calibration, channel, force_N, rise_K, samples)
 
-    # -- tests --------------------------------------------------------------------------------------------------------
-
     def test(self, model: Model, effects: Sequence[Effect]) -> list[Candidate]:
         """Each effect in the shape that does best, with its chance corrected for all that were tried."""
         from scipy.stats import false_discovery_control
@@ -205,8 +203,6 @@ class Screening:
             values=dict(zip(names, evidence.values.tolist(), strict=False)),
             sigmas=dict(zip(names, evidence.sigmas.tolist(), strict=False)),
         )
-
-    # -- objections ---------------------------------------------------------------------------------------------------
 
     def judge(self, model: Model, candidate: Candidate, rivals: Rivals, tested: Sequence[Candidate]) -> Candidate:
         """With the reason why it may not be accepted, empty if it may, and its placebos if they were asked. ``tested``: all
@@ -296,8 +292,6 @@ class Screening:
         none, another cause keeps its own."""
         alone, both = (self._left_out_with(model, candidate.channel, signal, own) for own in ((), candidate.columns))
         return float((alone - both).sum())
-
-    # -- placebos -----------------------------------------------------------------------------------------------------
 
     def with_placebos(self, model: Model, candidate: Candidate) -> Candidate:
         """With the share of its gain that it reaches with what it rests on disturbed, if it gains anything."""
