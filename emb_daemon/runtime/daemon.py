@@ -26,7 +26,7 @@ from emb_daemon.jit import Array, compile_beside, compile_within, entry, njit
 from emb_daemon.pipeline import LATE_CYCLES, SHOWN_NS, Pipeline
 from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.changes import ChangeLog
-from emb_daemon.runtime.journal import log
+from emb_daemon.runtime.journal import log, note
 from emb_daemon.runtime.pages import PATIENCE_S, Answer, PageListener, Request, socket_path
 from emb_daemon.runtime.reading import Reader, differing
 from emb_daemon.runtime.shared import SharedEstimates
@@ -235,10 +235,8 @@ class Daemon:
     def run(self) -> None:
         """Tick until `stop`."""
         for name, calibration in self._setup.calibrations.items():
-            identity = {"corner": name, "actuator": calibration.actuator, "calibration": calibration_hash(calibration)}
-            log.info(
-                "corner %(corner)s: actuator %(actuator)s, calibration %(calibration)s", identity, extra={"fields": identity}
-            )
+            text = "corner %(corner)s: actuator %(actuator)s, calibration %(calibration)s"
+            note(text, corner=name, actuator=calibration.actuator, calibration=calibration_hash(calibration))
         now = time.monotonic_ns()
         self.pipeline.begin(now)
         pacer = Pacer(now)
@@ -406,11 +404,10 @@ class Daemon:
         waiting = {}
         for name, hashed in in_use.items():
             if name not in changed:
-                words = {"corner": name, "calibration": hashed}
-                log.info("corner %(corner)s: calibration %(calibration)s unchanged", words, extra={"fields": words})
+                note("corner %(corner)s: calibration %(calibration)s unchanged", corner=name, calibration=hashed)
                 continue
-            words = {"corner": name, "calibration": calibration_hash(changed[name])}
-            log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
+            read = calibration_hash(changed[name])
+            note("corner %(corner)s: calibration %(calibration)s read", corner=name, calibration=read)
             waiting[name] = changed[name], self._adaptation.read(name, changed[name]) if self._adaptation else None
         if request:
             request.read, request.fault = waiting, ""
@@ -430,8 +427,8 @@ class Daemon:
             self._adaptation.replace(name, calibration, learned, on_page)
             calibration = self._adaptation.in_use(name)
         self.pipeline.begin_anew(CORNERS.index(name), to_parameters(calibration))
-        words = {"corner": name, "calibration": calibration_hash(self._calibrations[name])}
-        log.info("corner %(corner)s: starts anew with calibration %(calibration)s", words, extra={"fields": words})
+        now = calibration_hash(self._calibrations[name])
+        note("corner %(corner)s: starts anew with calibration %(calibration)s", corner=name, calibration=now)
 
     def _ping(self) -> bool:
         """Ping the watchdog if a restart would not help; otherwise log the reason and return False.
