@@ -22,12 +22,9 @@ def name_in_errors(path: Path):
 
 
 def write_atomically(path: Path, content: bytes | memoryview) -> None:
-    """Replace ``path`` by ``content``: a reader, or a kill at any moment, finds the old file or the new one.
-
-    Raises:
-        OSError: the folder cannot be written, or ``path`` is a folder, device or pipe, which a file would replace; what was
-            there is untouched.
-    """
+    """Replace ``path`` by ``content``: a reader, or a kill at any moment, finds the old file or the new one. Raises OSError:
+    the folder cannot be written, or ``path`` is a folder, device or pipe, which a file would replace; what was there is
+    untouched."""
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "expected a regular file or none", str(path))
     with name_in_errors(path):
@@ -52,11 +49,8 @@ def _write_beside(path: Path, content: bytes | memoryview) -> None:
 
 def write_in_reserve(path: Path, content: bytes, size: int) -> None:
     """`write_atomically` for a file that must be replaced on a full disk too: at least ``size`` bytes long, filled up with
-    blanks, it takes turns with a second file, whose room on the disk is taken with the first call.
-
-    Raises:
-        OSError: the folder cannot be written; what was there is untouched.
-    """
+    blanks, it takes turns with a second file, whose room on the disk is taken with the first call. Raises OSError: the folder
+    cannot be written; what was there is untouched."""
     spare = path.with_name(f".{path.name}.spare")
     with name_in_errors(path):
         _fill(spare, content.ljust(size))

@@ -79,8 +79,7 @@ def compile_beside(
 
     Only if ``function`` is not in the cache, there is a second CPU, and no other thread that may hold a lock. Then this
     process does ``parts`` at once, with `compile_within`: kernels that the work calls late, and then finds in the cache.
-    Returns a function that waits for the end of the work.
-    """
+    Returns a function that waits for the end of the work."""
     possible = threading.active_count() == 1 and len(os.sched_getaffinity(0)) > 1
     if _private is not None or not possible:
         return lambda: None

@@ -95,8 +95,6 @@ class Pipeline:
     Attributes:
         states: STATE array, shape (4,): the estimators.
         samples, estimates: SAMPLE and ESTIMATE rows of the last call, row by row.
-        disturbed: reason bits, shape (4,), that the loop adds to estimates, because frames do not show them: bus and
-        deadlines.
     """
 
     def __init__(
@@ -112,6 +110,7 @@ class Pipeline:
         self.samples: np.ndarray = np.zeros(capacity, SAMPLE)
         self.estimates: np.ndarray = np.zeros(capacity, ESTIMATE)
         self.frames: np.ndarray = np.zeros(4 * capacity, FRAME)
+        #: Reason bits that the loop adds to estimates, because frames do not show them: bus and deadlines.
         self.disturbed: np.ndarray = np.zeros(4, np.int64)
         self.layout: np.ndarray = wire.default_layout() if layout is None else layout
         self.receptions: np.ndarray = new_reception()
@@ -265,8 +264,7 @@ def _cycles(corner, counter, time_ns):
 
     The Counter gives the number of cycles modulo 15, whatever the delay of the frame. It is used as long as delays of frames
     are made up for by later ones. In a log at a reduced rate the Counter counts frames instead of cycles, and a sender can
-    pause: then the delay stays or grows, and the time of arrival is used until both agree again.
-    """
+    pause: then the delay stays or grows, and the time of arrival is used until both agree again."""
     step = (counter - corner.counter) % COUNTER_MODULO
     if step == 0:
         step = COUNTER_MODULO

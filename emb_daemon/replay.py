@@ -35,8 +35,7 @@ _PAUSE_NS = 1_000_000_000
 class Result:
     """One corner of a replayed log: ESTIMATE and SAMPLE rows, one per resolver sample, and times on the log's own clock.
 
-    Times in ``estimates``, ``samples`` and ``reference`` are on the drive's clock, which continues from log to log.
-    """
+    Times in ``estimates``, ``samples`` and ``reference`` are on the drive's clock, which continues from log to log."""
 
     path: Path
     time_ns: np.ndarray
@@ -80,19 +79,13 @@ class Replay:
     """A drive made of logs.
 
     Args:
-        calibration: of the corners' actuators.
         corner: FL, FR, RL, RR, or ``all`` for every corner in the first log.
         measured_torque: use the rig's brake torque sensor for the heat model instead of the estimated force.
         state: folder from which learned values are restored and in which adaptation stores them; without one, nothing is
             learned.
         read: a log's FRAME array by its path; `logs.mapping.Mapping.read` for logs of other rigs.
-        start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation always begins
-            with the log, because otherwise the contact angle would be unknown.
-
-    Attributes:
-        corners: those that are estimated; for ``all`` known from the first log on.
-        adaptation: the adaptation, if there is a state folder.
-        notes: a line for each signal of a log with values that the daemon does not use.
+        start_s, end_s: seconds of each log, from its first frame, between which results are given. Estimation always
+            begins with the log, because otherwise the contact angle would be unknown.
     """
 
     def __init__(
@@ -110,9 +103,9 @@ class Replay:
         self._memory = Memory(state) if state else None
         self._end_ns: int | None = None
         self._pipeline: Pipeline | None = None
-        self.adaptation: Adaptation | None = None
-        self.corners: tuple[str, ...] = ()
-        self.notes: list[str] = []
+        self.adaptation: Adaptation | None = None  #: the adaptation, if there is a state folder
+        self.corners: tuple[str, ...] = ()  #: those that are estimated; for ``all`` known from the first log on
+        self.notes: list[str] = []  #: a line for each signal of a log with values that the daemon does not use
         if corner != ALL:
             self._build((CORNERS[corner_index(corner)],))
 

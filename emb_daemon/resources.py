@@ -9,11 +9,8 @@ _PACKAGE = Path(__file__).parent
 def resource(name: str) -> Path:
     """Path of a shipped file such as ``dbc/emb.dbc``.
 
-    In a wheel they are inside the package, in a checkout next to it.
-
-    Raises:
-        FileNotFoundError: the installation is incomplete.
-    """
+    In a wheel they are inside the package, in a checkout next to it. Raises FileNotFoundError: the installation is
+    incomplete."""
     for root in (_PACKAGE / "_resources", _PACKAGE.parent):
         path = root / name
         if path.exists():

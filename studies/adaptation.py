@@ -77,8 +77,7 @@ def wear(calibration: Calibration, trainings: int) -> dict:
     ``trainings`` cycles, evenly spread, have training motion, and the force is judged on random motor angles (thesis
     3.3.2) afterwards, in the state of wear then reached; the cycles between only wear the pads. The daemon is restarted each
     time, so that learned values come from its memory. The clearance stays the same, because the actuator follows wear.
-    Simulated car, whose brake shares no force model with the estimator.
-    """
+    Simulated car, whose brake shares no force model with the estimator."""
     from emb_daemon.plant.car import Car
     from emb_daemon.plant.derive import plant_from_calibration
     from emb_daemon.plant.scenarios import commands_of, random_angle

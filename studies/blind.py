@@ -107,19 +107,14 @@ _LEFT, _NOTHING = 1.5, 1.2
 
 @dataclass(frozen=True)
 class Rest:
-    """What is left of one path on the validation log, as RMS (N) of means over `LASTING` samples.
+    """What is left of one path on the validation log, as RMS (N) of means over `LASTING` samples."""
 
-    Attributes:
-        after: with the calibration that `diagnose` wrote.
-        plain, fitted: of the same unit and schedule with nothing hidden, by the calibration as it was, and fitted to that very
-            log: what it achieves on such units, and what it could.
-        said: whether the report says that something is unexplained there.
-    """
-
-    after: float
+    after: float  #: with the calibration that `diagnose` wrote
+    #: ``plain`` and ``fitted``: of the same unit and schedule with nothing hidden, by the calibration as it was, and fitted to
+    #: that very log: what it achieves on such units, and what it could.
     plain: float
     fitted: float
-    said: bool
+    said: bool  #: whether the report says that something is unexplained there
 
     @property
     def anything(self) -> bool | None:

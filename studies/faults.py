@@ -24,34 +24,21 @@ def _nothing(*_):
 
 @dataclass
 class Fault:
-    """One fault or change.
+    """One fault or change."""
 
-    Attributes:
-        size: what was drawn, in words.
-        onset_s: when it begins; 0 where it is there from the start.
-        brake: changes the PLANT record before the drive; ``pads_mm`` mounts other pads first.
-        car: called as (car, time_s) before every stretch of the drive.
-        bus: called as (frames, time_s), returns the frames that reach the daemon.
-        effects: effects that both brake and calibration have, so that they are no change.
-        ambient_C: of the surroundings, and at the start of everything except for ``warm_C``.
-        warm_C: of the disc, of plates and caliper, and the share of the pads' rise that their softening remembers.
-        power_on_s: when the daemon first hears anything.
-        restarts: (time, silence before it, in s) of further starts of the daemon.
-        latched_N: the drive begins parked on the latch with this force.
-    """
-
-    size: str
-    onset_s: float = 0.0
-    brake: Callable = _nothing
+    size: str  #: what was drawn, in words
+    onset_s: float = 0.0  #: when it begins; 0 where it is there from the start
+    brake: Callable = _nothing  #: changes the PLANT record before the drive; ``pads_mm`` mounts other pads first
     pads_mm: float | None = None
-    car: Callable = _nothing
-    bus: Callable = lambda frames, _: frames
-    effects: dict = field(default_factory=dict)
-    ambient_C: float = 22.0
+    car: Callable = _nothing  #: called as (car, time_s) before every stretch of the drive
+    bus: Callable = lambda frames, _: frames  #: called as (frames, time_s), returns the frames that reach the daemon
+    effects: dict = field(default_factory=dict)  #: effects that both brake and calibration have, so that they are no change
+    ambient_C: float = 22.0  #: of the surroundings, and at the start of everything except for ``warm_C``
+    #: Of the disc, of plates and caliper, and the share of the pads' rise that their softening remembers.
     warm_C: tuple[float, float, float] | None = None
-    power_on_s: float = 0.0
-    restarts: tuple[tuple[float, float], ...] = ()
-    latched_N: float = 0.0
+    power_on_s: float = 0.0  #: when the daemon first hears anything
+    restarts: tuple[tuple[float, float], ...] = ()  #: (time, silence before it, in s) of further starts of the daemon
+    latched_N: float = 0.0  #: the drive begins parked on the latch with this force
 
     @property
     def is_in_frames(self) -> bool:
@@ -123,8 +110,7 @@ def _write(frames, rows, signal, values, degraded):
 def alter(slot: int, column: int, change: Callable, degraded: bool = False) -> Callable:
     """A bus on which ``change(values, time_s)`` replaces one signal of corner FL or of the car; counters and CRC are right.
 
-    ``degraded``: the sender says so in its status.
-    """
+    ``degraded``: the sender says so in its status."""
     can_id, signal = _IDS[slot], _LAYOUT["received"][slot, column]
 
     def bus(frames, time_s):
@@ -147,6 +133,11 @@ def chain(*buses: Callable) -> Callable:
 
 def during(bus: Callable, begin_s: float, end_s: float = np.inf) -> Callable:
     return lambda frames, time_s: bus(frames, time_s) if begin_s <= time_s < end_s else frames
+
+
+def current_fault(told: str, at: float, change: Callable, **options: bool) -> Fault:
+    """The torque-producing current changed (`alter`) from a time on."""
+    return Fault(told, at, bus=during(alter(wire.CURRENT, wire.CURRENT_Q, change, **options), at))
 
 
 def ids_of(*slots: int) -> list[int]:
@@ -365,8 +356,7 @@ def torque_constant_fade(rng, moments, size):
 @_family
 def current_gain(rng, moments, size):
     gain, at = 1.0 + draw_signed(rng, 0.02, 0.15), pick_sometime(rng, moments)
-    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values)
-    return Fault(f"x {gain:.3f}", at, bus=during(change, at))
+    return current_fault(f"x {gain:.3f}", at, lambda values, _: gain * values)
 
 
 @_family
@@ -379,15 +369,13 @@ def current_offset(rng, moments, size):
 def current_offset_later(rng, moments, size):
     offset = size.current * draw_signed(rng, 0.2, 3.0)
     at = pick_driving(rng, moments) if rng.random() < 0.5 else pick_clamped(rng, moments)
-    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: values + offset)
-    return Fault(f"{offset:+.2f} A", at, bus=during(change, at))
+    return current_fault(f"{offset:+.2f} A", at, lambda values, _: values + offset)
 
 
 @_family
 def current_offset_drift(rng, moments, size):
     rate, at = size.current * draw_signed(rng, 0.005, 0.1), moments["go_1"]
-    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, time_s: values + rate * (time_s - at))
-    return Fault(f"{rate:+.3f} A/s", at, bus=during(change, at))
+    return current_fault(f"{rate:+.3f} A/s", at, lambda values, time_s: values + rate * (time_s - at))
 
 
 @_family
@@ -560,7 +548,7 @@ def current_frozen(rng, moments, size):
 @_family
 def current_zero(rng, moments, size):
     at = pick_clamped(rng, moments) if rng.random() < 0.5 else pick_driving(rng, moments)
-    return Fault("", at, bus=during(alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: 0.0 * values), at))
+    return current_fault("", at, lambda values, _: 0.0 * values)
 
 
 @_family
@@ -573,8 +561,7 @@ def current_lost(rng, moments, size):
 def current_degraded(rng, moments, size):
     """The current sensor reads wrong and its sender's status says Degraded."""
     gain, at = float(rng.uniform(0.3, 0.8)), pick_driving(rng, moments)
-    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: gain * values, degraded=True)
-    return Fault(f"x {gain:.2f}", at, bus=during(change, at))
+    return current_fault(f"x {gain:.2f}", at, lambda values, _: gain * values, degraded=True)
 
 
 # Wheel and heat.

@@ -57,11 +57,7 @@ class Stage:
 
 
 def stages(path: Path, calibration: Calibration) -> list[Stage]:
-    """Every stage from a log to estimates; complete replays last.
-
-    Raises:
-        InputError: not readable, or without samples.
-    """
+    """Every stage from a log to estimates; complete replays last. Raises InputError: not readable, or without samples."""
     # Not imported by the workers, whose memory would not be a fleet's.
     from emb_daemon.fleet.scores import Scorer
 
@@ -99,11 +95,7 @@ class Reading:
 
 
 def readings(path: Path) -> Iterator[Reading]:
-    """Read the frames of a log from the formats that are read in bulk.
-
-    Raises:
-        InputError: not readable.
-    """
+    """Read the frames of a log from the formats that are read in bulk. Raises InputError: not readable."""
     import can
 
     frames = read_frames(path)
@@ -132,11 +124,8 @@ class Scaling:
 
 
 def scaling(path: Path, calibration: Calibration, workers: int) -> Scaling:
-    """Replay copies of a log's first drive with one worker and with several, in turns; medians.
-
-    Raises:
-        InputError: not readable, or without samples.
-    """
+    """Replay copies of a log's first drive with one worker and with several, in turns; medians. Raises InputError: not
+    readable, or without samples."""
     with tempfile.TemporaryDirectory() as folder, cluster(None, 1) as one, cluster(None, workers) as several:
         root = Path(folder)
         first = Drive(**ingest(root, Job(path, "unit", ""))["drives"][0])

@@ -13,24 +13,20 @@ _HARMONICS = 4
 
 @dataclass(frozen=True)
 class Response:
-    """Frequency response at several frequencies and its first-order fit.
+    """Frequency response at several frequencies and its first-order fit."""
 
-    Attributes:
-        frequency_Hz: shape (n,).
-        measured, model: complex F / F_s, shape (n,); the model's is that of the identified dynamics, which saw none of this.
-        gain, gain_sigma: K of the first-order fit.
-        time_constant_s, time_constant_sigma_s: tau of the first-order fit.
-        fitted: |F / F_s| of the first-order fit, shape (n,).
-    """
-
-    frequency_Hz: np.ndarray
+    frequency_Hz: np.ndarray  #: shape (n,)
+    #: ``measured`` and ``model``: complex F / F_s, shape (n,); the model's is that of the identified dynamics, which saw none
+    #: of this.
     measured: np.ndarray
     model: np.ndarray
+    #: ``gain`` and ``gain_sigma``: K of the first-order fit.
     gain: float
     gain_sigma: float
+    #: ``time_constant_s`` and ``time_constant_sigma_s``: tau of the first-order fit.
     time_constant_s: float
     time_constant_sigma_s: float
-    fitted: np.ndarray
+    fitted: np.ndarray  #: |F / F_s| of the first-order fit, shape (n,)
 
 
 def phasor(signal: np.ndarray, time_s: np.ndarray, frequency_Hz: float) -> complex:
@@ -46,8 +42,7 @@ def phasor(signal: np.ndarray, time_s: np.ndarray, frequency_Hz: float) -> compl
 def steady_rows(log: Log, frequency_Hz: float) -> np.ndarray | None:
     """Rows of whole periods in which the angle is the stated sinusoid; None if there is not one such period.
 
-    Approach and return around the sinusoid do not follow it and are found by their misfit.
-    """
+    Approach and return around the sinusoid do not follow it and are found by their misfit."""
     angle, time = log.samples["angle"], log.time_s
     period = 1.0 / frequency_Hz
     length = round(period / CYCLE_S)
@@ -71,11 +66,8 @@ def steady_rows(log: Log, frequency_Hz: float) -> np.ndarray | None:
 
 
 def fit_first_order(frequency_Hz: np.ndarray, magnitude: np.ndarray) -> tuple[float, float, float, float]:
-    """1 / |G|^2 = (4 pi^2 tau^2 / K^2) f^2 + 1 / K^2 by least squares.
-
-    Returns:
-        (K, its standard deviation, tau in s, its standard deviation).
-    """
+    """1 / |G|^2 = (4 pi^2 tau^2 / K^2) f^2 + 1 / K^2 by least squares. Returns (K, its standard deviation, tau in s, its
+    standard deviation)."""
     design = np.column_stack([frequency_Hz**2, np.ones(len(frequency_Hz))])
     inverse = 1.0 / magnitude**2
     solution = np.linalg.lstsq(design, inverse, rcond=None)[0]

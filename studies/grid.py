@@ -194,11 +194,8 @@ class Brake(NamedTuple):
 
 @cache
 def brake_of(stranger: Path | None) -> Brake:
-    """Our own, or the stranger whose seed is the name of a folder that `studies.strangers` kept.
-
-    Raises:
-        InputError: the folder holds no calibration, or its name is no seed.
-    """
+    """Our own, or the stranger whose seed is the name of a folder that `studies.strangers` kept. Raises InputError: the folder
+    holds no calibration, or its name is no seed."""
     own = shipped_calibration()
     if stranger is None:
         return Brake(own, own, {}, None, Size(), _WHEEL_M)

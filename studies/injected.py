@@ -33,11 +33,8 @@ def _spells(mask: np.ndarray, time_s: np.ndarray, least_s: float) -> list[float]
 
 
 def _draw_moments(time_s: np.ndarray, force_N: np.ndarray, rng: np.random.Generator) -> dict[str, float]:
-    """Moments of a log by the names that a drive of `studies.grid` has.
-
-    Raises:
-        InputError: the brake never opens, or never closes.
-    """
+    """Moments of a log by the names that a drive of `studies.grid` has. Raises InputError: the brake never opens, or never
+    closes."""
     touching = force_N > _TOUCHING * np.nanmax(force_N)
     stops, opens = _spells(touching, time_s, _STOP_S), _spells(~touching, time_s, _OPEN_S)
     if not stops or not opens:

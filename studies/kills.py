@@ -68,8 +68,7 @@ def live(memory: Memory, calibration: Calibration, pads_mm: float, night: int = 
     """Run a parked car, ``night`` nights after the first, until the daemon has asked for training and told its result.
 
     Evaluation and writing are done between two ticks, not by a helper thread, which would get no time in a simulation that
-    runs faster than real time.
-    """
+    runs faster than real time."""
     plant = plant_from_calibration(calibration, pad_thickness_mm=pads_mm)
     car = Car(np.atleast_1d(plant), (_CORNER,), 1)
     adaptation = Adaptation({_CORNER: calibration}, memory, lambda _: time.time_ns() + night * _NIGHT_NS)

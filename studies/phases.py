@@ -28,29 +28,23 @@ POWER_ON_S = 0.5
 
 @dataclass(frozen=True)
 class Phase:
-    """Figures of one phase. ``failed`` names the criteria that it misses; NaN where there is nothing to judge.
-
-    Attributes:
-        silent_beyond, usable_beyond: shares beyond three sigma.
-        silent_large, longest_large_s: share, and longest stretch, of silent errors beyond 1 kN.
-        worst_silent_N: largest error of a silent sample.
-        useful: share with mode running and sigma up to 300 N.
-        rmse_N, sigma_N: of usable samples; sigma is their median.
-        better_path_N: RMSE of the better of both paths on these samples, which the fused force should keep to.
-    """
+    """Figures of one phase. ``failed`` names the criteria that it misses; NaN where there is nothing to judge."""
 
     name: str
     samples: int
     silent: float
+    #: ``silent_beyond`` and ``usable_beyond``: shares beyond three sigma.
     silent_beyond: float
     usable_beyond: float
+    #: ``silent_large`` and ``longest_large_s``: share, and longest stretch, of silent errors beyond 1 kN.
     silent_large: float
     longest_large_s: float
-    worst_silent_N: float
-    useful: float
+    worst_silent_N: float  #: largest error of a silent sample
+    useful: float  #: share with mode running and sigma up to 300 N
+    #: ``rmse_N`` and ``sigma_N``: of usable samples; sigma is their median.
     rmse_N: float
     sigma_N: float
-    better_path_N: float
+    better_path_N: float  #: RMSE of the better of both paths on these samples, which the fused force should keep to
     failed: tuple[str, ...]
 
     def as_dict(self) -> dict:
@@ -94,8 +88,7 @@ def judge(
 ) -> Phase:
     """Figures and verdict of one phase: ESTIMATE rows, their times and the reference force (NaN where none is known).
 
-    ``useful`` and ``rmse_N`` are promised where given: the smallest share of useful samples, the largest RMSE.
-    """
+    ``useful`` and ``rmse_N`` are promised where given: the smallest share of useful samples, the largest RMSE."""
     known = np.isfinite(reference_N)
     time_s, estimates, reference_N = time_s[known], estimates[known], reference_N[known]
     silent = np.isin(estimates["mode"], _RUNNING_MODES)

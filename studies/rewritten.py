@@ -41,19 +41,13 @@ Table = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Rewritten:
-    """A way to write a table.
+    """A way to write a table."""
 
-    Attributes:
-        rewrite: plain columns with ``time`` in s → those of the stranger.
-        signals: what the stranger's mapping says otherwise of a column; None of one that is not there.
-        time: the same of the time.
-        separator: between columns; with a semicolon decimals have a comma.
-    """
-
-    rewrite: Callable[[Table], Table] = dict
+    rewrite: Callable[[Table], Table] = dict  #: plain columns with ``time`` in s → those of the stranger
+    #: What the stranger's mapping says otherwise of a column; None of one that is not there.
     signals: Mapping[str, dict | None] = field(default_factory=dict)
-    time: dict = field(default_factory=dict)
-    separator: str = ","
+    time: dict = field(default_factory=dict)  #: the same of the time
+    separator: str = ","  #: between columns; with a semicolon decimals have a comma
 
 
 def _in_units(**per_unit: float) -> Callable[[Table], Table]:

@@ -11,6 +11,7 @@ from studies.faults import (
     Fault,
     alter,
     chain,
+    current_fault,
     draw_signed,
     draw_size,
     during,
@@ -70,7 +71,7 @@ def resolver_repeats(rng, moments, size):
 @_family
 def current_repeats(rng, moments, size):
     cycles, at = int(rng.integers(2, 26)), pick_sometime(rng, moments)
-    return Fault(f"{cycles} times", at, bus=during(alter(wire.CURRENT, wire.CURRENT_Q, _repeat(cycles)), at))
+    return current_fault(f"{cycles} times", at, _repeat(cycles))
 
 
 @_family
@@ -265,23 +266,21 @@ def current_hum(rng, moments, size):
     def change(values, time_s):
         return values + amplitude * np.sin(omega * (time_s + CYCLE_S * np.arange(len(values))))
 
-    bus = during(alter(wire.CURRENT, wire.CURRENT_Q, change), at)
-    return Fault(f"{amplitude:.1f} A, {frequency:.0f} Hz", at, bus=bus)
+    return current_fault(f"{amplitude:.1f} A, {frequency:.0f} Hz", at, change)
 
 
 @_family
 def current_dead_band(rng, moments, size):
     """Small currents are read as zero."""
     band, at = size.current * draw_size(rng, 0.3, 4.0), pick_sometime(rng, moments)
-    change = alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: np.where(np.abs(values) < band, 0.0, values))
-    return Fault(f"below {band:.1f} A", at, bus=during(change, at))
+    return current_fault(f"below {band:.1f} A", at, lambda values, _: np.where(np.abs(values) < band, 0.0, values))
 
 
 @_family
 def current_absolute(rng, moments, size):
     """The sender gives the current's amount without its sign."""
     at = 0.0 if rng.random() < 0.5 else pick_driving(rng, moments)
-    return Fault("", at, bus=during(alter(wire.CURRENT, wire.CURRENT_Q, lambda values, _: np.abs(values)), at))
+    return current_fault("", at, lambda values, _: np.abs(values))
 
 
 @_family

@@ -165,11 +165,8 @@ def _print_families(table: list[dict]) -> None:
 
 
 def _write_table(page: Path, table: list[dict], options: str) -> None:
-    """The section of a page between its two `detection times` comments, anew.
-
-    Raises:
-        InputError: the page has no such comments.
-    """
+    """The section of a page between its two `detection times` comments, anew. Raises InputError: the page has no such
+    comments."""
     text = page.read_text()
     head, begin, rest = text.partition(_BEGIN)
     _, end, tail = rest.partition(_END)
@@ -197,9 +194,7 @@ def _seconds(value: float) -> str:
 
 def _families(given: str | None, usual: Iterable[str]) -> list[str]:
     """Names of families that are ``given``, comma-separated, or by the module that holds them; the ``usual`` ones if none are.
-
-    Raises:
-        InputError: an unknown name."""
+    Raises InputError: an unknown name."""
     from studies import senders, unlisted
     from studies.grid import FAMILIES
 

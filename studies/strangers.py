@@ -190,11 +190,8 @@ def record(stranger: Stranger, seed: int, folder: Path, without: Sequence[str] =
 
 
 def _thin(campaign: dict, without: Sequence[str]) -> dict:
-    """A campaign without some of its parts, and without entries of some of its logs, by the log's name.
-
-    Raises:
-        ValueError: it has none of a name.
-    """
+    """A campaign without some of its parts, and without entries of some of its logs, by the log's name. Raises ValueError: it
+    has none of a name."""
 
     def kept(entry):
         return not any(f"{name}.log" in entry.values() for name in without)

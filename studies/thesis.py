@@ -74,11 +74,8 @@ def _travel(log: Log) -> np.ndarray:
 
 
 def best_fit_line(log: Log) -> tuple[float, np.ndarray, np.ndarray]:
-    """Thesis 2.1: line of best fit through the loop of a slow clamp and release.
-
-    Returns:
-        (clearance in rad, coefficients, residual in N at each sample with a reference).
-    """
+    """Thesis 2.1: line of best fit through the loop of a slow clamp and release. Returns (clearance in rad, coefficients,
+    residual in N at each sample with a reference)."""
     x, known = _travel(log), np.isfinite(log.force_N)
     force, guess = log.force_N[known], clearance_guess(log, x)
     span = float(x.max() - guess)

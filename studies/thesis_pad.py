@@ -81,13 +81,9 @@ def thesis_profiles(
     disc_rate: np.ndarray,
     dt: float,
 ) -> np.ndarray:
-    """Pad temperatures (n, nodes) of the thesis's model, started at the backing plate's temperature.
-
-    Args:
-        p: THERMAL, shape (1,).
-        backplate, ambient: degC, shape (n,).
-        flux, braking, disc_rate: W/m^2, bool and 1/s over the step that starts at each row.
-    """
+    """Pad temperatures (n, nodes) of the thesis's model, started at the backing plate's temperature. ``p``: THERMAL, shape
+    (1,); ``backplate``, ``ambient``: degC, shape (n,); ``flux``, ``braking``, ``disc_rate``: W/m^2, bool and 1/s over the step
+    that starts at each row."""
     nodes = thesis_nodes(float(p["thickness"][0]))
     profiles = np.empty((len(flux), nodes))
     thesis_pad_run(p, np.full(nodes, backplate[0]), backplate, ambient, flux, braking, disc_rate, dt, profiles)

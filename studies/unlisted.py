@@ -14,6 +14,7 @@ from studies.faults import (
     Fault,
     alter,
     chain,
+    current_fault,
     draw_signed,
     draw_size,
     during,
@@ -318,21 +319,17 @@ def _draw_loose(rng) -> tuple[str, tuple]:
     return told, _LOOSE[told]
 
 
-def _current_fault(told: str, at: float, change: Callable) -> Fault:
-    return Fault(told, at, bus=during(alter(wire.CURRENT, wire.CURRENT_Q, change), at))
-
-
 @_family
 def current_saturates(rng, moments, size):
     limit, at = size.current * draw_size(rng, 4.0, 20.0), pick_sometime(rng, moments)
-    return _current_fault(f"at {limit:.1f} A", at, lambda values, _: np.clip(values, -limit, limit))
+    return current_fault(f"at {limit:.1f} A", at, lambda values, _: np.clip(values, -limit, limit))
 
 
 @_family
 def current_gain_of_one_sign(rng, moments, size):
     gain, sign, at = 1.0 + draw_signed(rng, 0.03, 0.3), float(rng.choice([-1.0, 1.0])), pick_sometime(rng, moments)
     told = f"x {gain:.2f} where {'positive' if sign > 0.0 else 'negative'}"
-    return _current_fault(told, at, lambda values, _: np.where(sign * values > 0.0, gain * values, values))
+    return current_fault(told, at, lambda values, _: np.where(sign * values > 0.0, gain * values, values))
 
 
 @_family
@@ -348,7 +345,7 @@ def current_remanence(rng, moments, size):
             shown[row] = value + state[0]
         return shown
 
-    return _current_fault(f"{100 * share:.1f} %", at, change)
+    return current_fault(f"{100 * share:.1f} %", at, change)
 
 
 def _low_pass(time_constant_s: float) -> Callable:
@@ -367,7 +364,7 @@ def _low_pass(time_constant_s: float) -> Callable:
 @_family
 def current_filtered(rng, moments, size):
     seconds, at = draw_size(rng, 0.003, 0.05), pick_sometime(rng, moments)
-    return _current_fault(f"{1e3 * seconds:.0f} ms", at, _low_pass(seconds))
+    return current_fault(f"{1e3 * seconds:.0f} ms", at, _low_pass(seconds))
 
 
 @_family

@@ -11,8 +11,7 @@ def samples(p, angle, dt: float = 0.004, friction=None, creep=(0.0, 1.0)) -> tup
     """SAMPLE rows of a motor that follows ``angle`` (rad past the released position), and the clamp force (N).
 
     The current is what the torque balance asks for, with friction that turns over within the presliding angle, or with the
-    share ``friction`` of full friction at each sample. ``creep``: share of the force that lags, and its time constant, s.
-    """
+    share ``friction`` of full friction at each sample. ``creep``: share of the force that lags, and its time constant, s."""
     angle = np.asarray(angle, float)
     speed = np.gradient(angle, dt)
     travel = np.maximum(angle - p["clearance"], 0.0)

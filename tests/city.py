@@ -34,3 +34,12 @@ def changed(change=lambda samples: None, seed: int = 0, seconds: float = 15.0) -
     samples = samples.copy()
     change(samples)
     return estimated(samples), force
+
+
+def assert_undone(estimates: np.ndarray, force: np.ndarray, seed: int) -> None:
+    """From the second clearance of 40 s on: hardly more error than where nothing was changed, and none beyond sigma."""
+    unmoved, _ = changed(seed=seed, seconds=40.0)
+    second = slice(SECOND_CLEARANCE, None)
+    error = (estimates["force"] - force)[second]
+    assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean((unmoved["force"] - force)[second] ** 2)) + 25.0
+    assert np.mean(np.abs(error) > 3.0 * np.hypot(estimates["sigma"][second], 25.0)) < 0.01

@@ -50,8 +50,7 @@ def update_errors(x, P, innovation, h, variance):
 def heat_matrices(p, pads, disc, ambient, braking, wheel_speed):
     """Heat capacities (J/K), conductances between nodes (W/K, symmetric), to the surroundings, and to backing plates.
 
-    Nodes 0..n-1 are the inner pad from its friction surface, n..2n-1 the outer one, 2n the disc.
-    """
+    Nodes 0..n-1 are the inner pad from its friction surface, n..2n-1 the outer one, 2n the disc."""
     positions, area = p["node_position"], p["area"]
     nodes = len(positions)
     edges = np.concatenate([[0.0], 0.5 * (positions[1:] + positions[:-1]), [positions[-1]]])

@@ -243,31 +243,20 @@ def test_a_frame_that_was_queued_long_after_it_was_stamped_keeps_its_stamp(monke
             assert abs(heard_ns - arrived_ns) < _CLOCKS_NS
 
 
-def test_microseconds_between_reading_two_clocks_move_no_stamp(monkeypatch):
-    """Stamps stay whole microseconds apart, as in a log of the bus: else a sample's age is rounded another way live."""
-    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    with near, far:
-        bus, real = RawCanSocket(near), time.time_ns
-        before = bus._offset_ns
-        for apart_ns in (50_000, -50_000):
-            monkeypatch.setattr(time, "time_ns", lambda apart_ns=apart_ns: real() + apart_ns)
-            far.send(bytes(16))
-            assert len(bus.drain()) == 1
-            assert bus._offset_ns == before
-
-
-def test_a_hold_up_between_reading_two_clocks_moves_no_stamp(monkeypatch):
-    """The scheduler may take the CPU away at any place; 10 ms there once made genuine frames look early."""
+@pytest.mark.parametrize(("apart_ns", "held_up_s"), [(50_000, 0.0), (-50_000, 0.0), (0, 0.01)])
+def test_what_passes_between_reading_two_clocks_moves_no_stamp(monkeypatch, apart_ns, held_up_s):
+    """Microseconds: stamps stay whole microseconds apart, as in a log of the bus, else a sample's age is rounded another way
+    live. And a hold-up: the scheduler may take the CPU away at any place; 10 ms there once made genuine frames look early."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with near, far:
         bus, real = RawCanSocket(near), time.time_ns
         before = bus._offset_ns
 
-        def held_up():
-            time.sleep(0.01)
-            return real()
+        def clock():
+            time.sleep(held_up_s)
+            return real() + apart_ns
 
-        monkeypatch.setattr(time, "time_ns", held_up)
+        monkeypatch.setattr(time, "time_ns", clock)
         far.send(bytes(16))
         assert len(bus.drain()) == 1
         assert bus._offset_ns == before

@@ -93,8 +93,7 @@ def _profile(pad, positions, disc):
 def test_mesh_error_over_a_braking_cycle(thermal):
     """The mesh that runs in the daemon against one eight times finer: 60 s of braking into 30 s of release.
 
-    The worst of the surface is the moment at which braking ends; where thermocouples sit and in the mean it is small.
-    """
+    The worst of the surface is the moment at which braking ends; where thermocouples sit and in the mean it is small."""
     fine = {name: thermal[name] for name in thermal.dtype.names}
     coarse_nodes = thermal["node_position"]
     parts = (coarse_nodes[:-1, None] + np.diff(coarse_nodes)[:, None] * np.arange(8) / 8.0).ravel()

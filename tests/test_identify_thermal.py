@@ -45,8 +45,7 @@ CELLS = 60
 def _plant(p, dt, every, power, touching, speed, out):
     """Explicit heat balance of 2 x 60 cells with their own backing plates: another mesh, another time scheme.
 
-    ``out`` (rows, 13): pads at 2, 4, 6, 8 mm (inner, outer), disc, backing plates, pad means.
-    """
+    ``out`` (rows, 13): pads at 2, 4, 6, 8 mm (inner, outer), disc, backing plates, pad means."""
     cell = p.thickness / CELLS
     store = p.density * p.specific_heat * cell
     pads = np.full((2, CELLS), 22.0)

@@ -259,13 +259,17 @@ def test_a_torque_that_friction_or_an_uneven_disc_may_hold_swings_beside_a_stand
     assert np.any(estimates["reasons"][HOLDING:BEFORE_RELEASE] & r.STUCK) == stuck
 
 
+def _repeated_with_noise(count, speed):
+    """Estimates of one sample again and again, with a speed, and noise of the current alone."""
+    rows = np.repeat(drive()[0][RELEASED : RELEASED + 1], count)
+    rows["dt"], rows["speed"] = 0.004, speed
+    rows["current_q"] = np.random.default_rng(1).normal(0.0, 0.3, count)
+    return estimated(rows)
+
+
 def test_resolver_that_stands_still_with_noise_is_no_fault():
     """A motor at rest may read the same angle for ever, as long as its speed reads zero."""
-    samples, _ = drive()
-    rows = np.repeat(samples[RELEASED : RELEASED + 1], 600)
-    rows["dt"], rows["speed"] = 0.004, 0.0
-    rows["current_q"] = np.random.default_rng(1).normal(0.0, 0.3, len(rows))
-    estimates = estimated(rows)
+    estimates = _repeated_with_noise(600, 0.0)
     assert not np.any(estimates["reasons"] & (r.STUCK | r.PATHS_DISAGREE))
 
 
@@ -279,11 +283,7 @@ def test_resolver_that_flickered_and_repeats_is_stuck():
 
 def test_resolver_that_never_flickered_and_repeats_a_speed_is_stuck():
     """From power-on: nothing is known of its noise, so it takes fifty samples of a speed that is not zero."""
-    samples, _ = drive()
-    rows = np.repeat(samples[RELEASED : RELEASED + 1], 200)
-    rows["dt"], rows["speed"] = 0.004, 0.7
-    rows["current_q"] = np.random.default_rng(1).normal(0.0, 0.3, len(rows))
-    estimates = estimated(rows)
+    estimates = _repeated_with_noise(200, 0.7)
     stuck = np.flatnonzero(estimates["reasons"] & r.STUCK)
     assert 45 < stuck[0] < 55 and np.all(estimates["source"][stuck] == r.TORQUE_ONLY)
 

@@ -67,8 +67,7 @@ def drive(
 ) -> list[np.ndarray]:
     """Frames of one corner and its car for ``cycles`` resolver cycles from cycle ``first`` on.
 
-    ``angle`` (rad), ``speed`` (rad/s) and ``current`` (A) by cycle, over and over.
-    """
+    ``angle`` (rad), ``speed`` (rad/s) and ``current`` (A) by cycle, over and over."""
     frames = []
     for cycle in range(first, first + cycles):
         now, counter = start_ns + cycle * 4 * MS, cycle % 15

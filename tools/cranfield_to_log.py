@@ -49,11 +49,8 @@ _CYCLE_S = 0.004
 
 
 def read(path: Path) -> dict[tuple[int, int], dict[str, np.ndarray]]:
-    """Columns by load (kgf) and run: ``time`` s, ``set`` and ``error`` mm, ``current`` A, strokes one after the other.
-
-    Raises:
-        InputError: not a table of the set.
-    """
+    """Columns by load (kgf) and run: ``time`` s, ``set`` and ``error`` mm, ``current`` A, strokes one after the other. Raises
+    InputError: not a table of the set."""
     names = {"set_point": "set", "position_error": "error", "current": "current", "time": "time"}
     found: dict[tuple[int, int], dict[str, list[float]]] = {}
     try:

@@ -46,11 +46,8 @@ signals:
 
 
 def read_header(path: Path) -> tuple[float, str]:
-    """Values that a run's header states: the first motor's torque constant, N m/A, and the torque sensor's column.
-
-    Raises:
-        InputError: not a run with both.
-    """
+    """Values that a run's header states: the first motor's torque constant, N m/A, and the torque sensor's column. Raises
+    InputError: not a run with both."""
     with path.open(errors="replace") as file:
         header = file.read(4000)
     constant, sensor = re.search(r"kt_1 = ([\d.]+)", header), re.search(r",(tr[sd]605\S* torque \[Nm\])", header)
@@ -60,11 +57,8 @@ def read_header(path: Path) -> tuple[float, str]:
 
 
 def whole_and_halves(run: Path, mapping: str, folder: Path) -> dict[str, np.ndarray]:
-    """FRAME arrays of a run as this mapping reads it, which is left in ``folder``.
-
-    Raises:
-        InputError, OSError: it cannot be read with it.
-    """
+    """FRAME arrays of a run as this mapping reads it, which is left in ``folder``. Raises InputError, OSError: it cannot be
+    read with it."""
     write_atomically(folder / "mapping.yaml", mapping.encode())
     frames = Mapping(folder / "mapping.yaml").read(run)
     half = np.searchsorted(frames["time_ns"], frames["time_ns"][[0, -1]].mean())

@@ -42,11 +42,7 @@ _DECIMATION = 4
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """Columns of an EMPS file.
-
-    Raises:
-        InputError: not an EMPS file.
-    """
+    """Columns of an EMPS file. Raises InputError: not an EMPS file."""
     from scipy.io import loadmat
 
     try:

@@ -35,28 +35,21 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 class Adaptation:
-    """Adaptation of all corners of one process.
+    """Adaptation of all corners of one process, whose learned values are kept in ``memory``.
 
-    Args:
-        calibrations: by corner name.
-        memory: where learned values are kept.
-        clock: the real time (CLOCK_REALTIME) that belongs to a sample's time, both in ns.
-        threaded: evaluate and write in a helper thread.
-
-    Attributes:
-        adapters, limits: ADAPTER and LIMITS arrays, shape (4,).
-        rows: TRAINING array, shape (4, CAPACITY).
-        learned: PARAMETERS array, shape (4,): result of each corner's last accepted evaluation.
-        reached: STATE array, shape (4,): of the path models with these at the end of the training.
-    """
+    ``clock``: the real time (CLOCK_REALTIME) that belongs to a sample's time, both in ns; ``threaded``: evaluate and write in
+    a helper thread."""
 
     def __init__(
         self, calibrations: dict[str, Calibration], memory: Memory, clock: Callable[[int], int], threaded: bool = False
     ):
+        #: ``adapters`` and ``limits``: ADAPTER and LIMITS arrays, shape (4,).
         self.adapters: np.ndarray = np.zeros(4, r.ADAPTER)
         self.limits: np.ndarray = np.zeros(4, r.LIMITS)
-        self.rows: np.ndarray = np.zeros((4, r.CAPACITY), r.TRAINING)
+        self.rows: np.ndarray = np.zeros((4, r.CAPACITY), r.TRAINING)  #: TRAINING array, shape (4, CAPACITY)
+        #: PARAMETERS array, shape (4,): result of each corner's last accepted evaluation.
         self.learned: np.ndarray = np.zeros(4, PARAMETERS)
+        #: STATE array, shape (4,): of the path models with these at the end of the training.
         self.reached: np.ndarray = np.zeros(4, STATE)
         self._remembered = np.zeros(4, r.REMEMBERED)
         self._memory, self._clock, self._threaded = memory, clock, threaded

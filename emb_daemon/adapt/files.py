@@ -42,7 +42,6 @@ def owner(version: int, corner: str, calibration: Calibration) -> dict[str, str 
 
 
 def encode(content: msgspec.Struct) -> bytes:
-    """A file's bytes."""
     body = msgspec.json.format(msgspec.json.encode(content), indent=1)
     return msgspec.json.encode(_Sealed(hashlib.sha256(body).hexdigest(), msgspec.Raw(body))) + b"\n"
 
@@ -70,8 +69,7 @@ def decode(data: bytes, kind: type[_Kept], version: int) -> _Kept:
 def read_own(path: Path, kind: type[_Mine], ours: dict[str, str | int]) -> tuple[_Mine | None, str | None]:
     """A file's content of type ``kind``, or None, and a warning for the log, or None.
 
-    A damaged file is set aside; one that does not belong to ``ours`` (`owner`) is not used.
-    """
+    A damaged file is set aside; one that does not belong to ``ours`` (`owner`) is not used."""
     try:
         found = decode(read(path), kind, ours["format"])
     except FileNotFoundError:

@@ -142,12 +142,8 @@ class _Training:
     """One training as a function of the fitted values: contact angle (rad), offset of the motor torque (N m), logarithm of the
     torque constant over the calibration's, load friction over gear gain, offset friction (N m), logarithms of the presliding
     angle and of the inertia over the calibration's, and the curve's coefficients in units of ``scale`` (N/rad^(n+1)).
-
-    Args:
-        rows: TRAINING array, the samples in order.
-        calibration: in use until now.
-        state: STATE record, as in `fit_training`.
-    """
+    ``rows``: TRAINING array, the samples in order; ``calibration``: in use until now; ``state``: STATE record, as in
+    `fit_training`."""
 
     def __init__(self, rows, calibration, state, scale):
         self._rows, self.calibration, self._state, self.scale = rows, calibration, state, scale
@@ -432,18 +428,12 @@ def fit_training(
     factor_sigma: float = 0.0,
     driven: Driven | None = None,
 ) -> Evaluation:
-    """Evaluate one training.
+    """Evaluate one training; the result's ``outcome`` says whether it may be used.
 
-    Args:
-        rows: TRAINING array, the samples in order.
-        calibration, base: the one in use until now, and the one of the file.
-        state: STATE record, the estimator's at the end of the training, with what its effects remembered at the beginning.
-        factor_sigma: standard deviation of the rows' stiffness factor, as a share of it.
-        driven: what stops had shown before.
-
-    Returns:
-        `Evaluation`; its ``outcome`` says whether it may be used.
-    """
+    ``rows``: TRAINING array, the samples in order; ``calibration`` is in use until now, ``base`` that of the file; ``state``:
+    STATE record, the estimator's at the end of the training, with what its effects remembered at the beginning;
+    ``factor_sigma``: standard deviation of the rows' stiffness factor, as a share of it; ``driven``: what stops
+    had shown before."""
     now, limits = to_parameters(calibration), calibration.adaptation
     if len(rows) < _LEAST_SAMPLES:
         return Evaluation(r.TOO_FEW, evidence={"samples": len(rows)})

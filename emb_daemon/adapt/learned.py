@@ -29,28 +29,22 @@ TRAVELS = 40
 
 @dataclass
 class Evaluation:
-    """Outcome of one training's evaluation.
+    """Outcome of one training's evaluation."""
 
-    Attributes:
-        outcome: ACCEPTED or the reason for the rejection; ``note`` gives its numbers, if any.
-        values, sigmas: by the calibration's keys.
-        contact_angle: on the resolver's present zero, rad; ``contact_sigma`` for the learned curve, rad.
-        torque_error, torque_error_sigma: error of the torque path by magnets and current sensor, as a share of the force.
-        inertia_error, inertia_sigma: error of the calibration's inertia, as a share of it.
-        evidence: figures for people, by name.
-    """
-
-    outcome: int
+    outcome: int  #: ACCEPTED or the reason for the rejection; ``note`` gives its numbers, if any
     note: str = ""
-    values: dict[str, float] = field(default_factory=dict)
+    values: dict[str, float] = field(default_factory=dict)  #: by the calibration's keys, as ``sigmas``
     sigmas: dict[str, float] = field(default_factory=dict)
-    contact_angle: float = np.nan
+    contact_angle: float = np.nan  #: on the resolver's present zero, rad; ``contact_sigma`` for the learned curve, rad
     contact_sigma: float = np.nan
+    #: ``torque_error`` and ``torque_error_sigma``: error of the torque path by magnets and current sensor, as a share of the
+    #: force.
     torque_error: float = 0.0
     torque_error_sigma: float = np.nan
+    #: ``inertia_error`` and ``inertia_sigma``: error of the calibration's inertia, as a share of it.
     inertia_error: float = 0.0
     inertia_sigma: float = np.nan
-    evidence: dict[str, float] = field(default_factory=dict)
+    evidence: dict[str, float] = field(default_factory=dict)  #: figures for people, by name
 
 
 def curve_terms(calibration: Calibration) -> int:

@@ -79,11 +79,7 @@ def state_directory(configured: str | None, relative_to: Path) -> Path | None:
 
 def hold(folder: Path) -> int:
     """Reserve a state directory, which may be read-only, for this process until it ends or the returned descriptor is closed.
-
-    Raises:
-        InputError: it cannot be made.
-        Unavailable: another process uses it.
-    """
+    Raises InputError: it cannot be made. Raises Unavailable: another process uses it."""
     descriptor = os.open(Memory(folder).folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -108,12 +104,7 @@ class Memory:
         return self.folder / f"adaptation-{corner}.json"
 
     def read(self, corner: str) -> Store | None:
-        """A corner's file; None if there is none.
-
-        Raises:
-            ValueError: damaged.
-            OSError: not readable.
-        """
+        """A corner's file; None if there is none. Raises ValueError: damaged. Raises OSError: not readable."""
         try:
             content = files.read(self.path(corner))
         except FileNotFoundError:
@@ -124,8 +115,7 @@ class Memory:
         """A corner's store for this calibration, empty if there is none; and a warning for the log or None.
 
         A file that is damaged, or contains values that are impossible for this brake, is set aside. A file of another actuator
-        or calibration is not used, and stays until something new is learned.
-        """
+        or calibration is not used, and stays until something new is learned."""
         path, ours = self.path(corner), files.owner(FORMAT, corner, calibration)
         self._sweep()
         store, warning = files.read_own(path, Store, ours)

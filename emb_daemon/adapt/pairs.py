@@ -114,8 +114,7 @@ def _fit_curve(pairs, weight, contact, terms):
 def curve_from_pairs(pairs: np.ndarray, terms: int) -> tuple[float, np.ndarray]:
     """Contact angle (rad) and ``terms`` coefficients of the best curve through the pairs; NaN if there is none.
 
-    Robust: pairs that lie far from a first fit lose weight in the second (Cauchy weights on the median residual).
-    """
+    Robust: pairs that lie far from a first fit lose weight in the second (Cauchy weights on the median residual)."""
     best, curve = np.nan, np.zeros(terms)
     if len(pairs) < 2 * terms + 2:
         return best, curve

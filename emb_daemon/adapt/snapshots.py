@@ -54,12 +54,7 @@ def from_fields(fields: dict[str, object], dtype: np.dtype) -> np.void:
 
 
 class Snapshots:
-    """The snapshots of one folder.
-
-    Args:
-        folder: an existing one.
-        dtype: of the record that is stored.
-    """
+    """The snapshots, records of ``dtype``, of an existing folder."""
 
     def __init__(self, folder: Path, dtype: np.dtype):
         self._folder, self._dtype = folder, dtype

@@ -136,11 +136,8 @@ def emit_object(entries: list[Entry], sources: str, target: Target) -> bytes:
 def linker_for(machine: str) -> list[str]:
     """A command that links for ``machine``, the best one that is installed.
 
-    A compiler finds libm; symbols that a bare linker leaves undefined are resolved when the library is loaded.
-
-    Raises:
-        Unavailable: none is; the message names packages that have one.
-    """
+    A compiler finds libm; symbols that a bare linker leaves undefined are resolved when the library is loaded. Raises
+    Unavailable: none is; the message names packages that have one."""
     own = machine == platform.machine()
     prefix = "" if own else f"{machine}-linux-gnu-"
     for command in (
@@ -170,12 +167,8 @@ def build(entries: list[Entry], sources: str, target: Target, path: Path, layout
     """Write the library of ``entries`` that were imported from ``sources`` (`library.source_digest`), with ``layouts`` as in
     `library.Manifest`.
 
-    With the ending ``.o`` it is a plain object, to be linked into a program.
-
-    Raises:
-        Unavailable: no linker for the target is installed.
-        OSError: the file cannot be written.
-    """
+    With the ending ``.o`` it is a plain object, to be linked into a program. Raises Unavailable: no linker for the target is
+    installed. Raises OSError: the file cannot be written."""
     linker = None if path.suffix == ".o" else linker_for(target.machine)
     path.parent.mkdir(parents=True, exist_ok=True)
     elf = emit_object(entries, sources, target)

@@ -190,11 +190,7 @@ def load() -> str:
     """Use the kernels of the library that is found by `find` in this process.
 
     Before anything that has kernels is imported. Returns why a library that is there is not used, numba being used instead;
-    empty if one is used, or there is none.
-
-    Raises:
-        InputError: numba is not installed either.
-    """
+    empty if one is used, or there is none. Raises InputError: numba is not installed either."""
     global _loaded, _manifest, _says
     path, why = find(), ""
     if path:

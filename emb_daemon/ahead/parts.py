@@ -11,8 +11,7 @@ class Part(JITCodeLibrary):
     """The bitcode of a function that only kernels call; it is optimised and translated together with them.
 
     numba's own libraries would optimise and translate each function on its own as well, with all that it calls, once for each
-    level of calls.
-    """
+    level of calls."""
 
     def serialize_using_object_code(self) -> tuple[str, str, bytes]:
         return self.serialize_using_bitcode()

@@ -12,6 +12,7 @@ import time
 
 import numpy as np
 
+from emb_daemon.bench.loop import quantiles
 from emb_daemon.calibration.files import shipped_calibration
 from emb_daemon.demo.recorder import Recorder
 from emb_daemon.plant.car import Car
@@ -68,8 +69,7 @@ def main() -> None:
     latency_us = 1e6 * np.concatenate([corner.response_s for corner in compared])
     result = {"samples": sum(corner.samples for corner in compared), "answered": len(latency_us)}
     result |= {"late": live.late, "lost": live.lost, "in_time": int(np.sum(latency_us <= CYCLE_NS / 1e3))}
-    median, tail = np.percentile(latency_us, (50, 99)) if len(latency_us) else (np.nan, np.nan)
-    print(json.dumps(result | {"p50_us": float(median), "p99_us": float(tail)}))
+    print(json.dumps(result | quantiles(latency_us)))
 
 
 if __name__ == "__main__":

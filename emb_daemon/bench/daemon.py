@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_daemon import jit
-from emb_daemon.bench.loop import is_held_up
+from emb_daemon.bench.loop import is_held_up, quantiles
 from emb_daemon.calibration.configuration import Setup
 from emb_daemon.runtime import daemon as loop
 from emb_daemon.runtime.journal import set_up_logging
@@ -128,17 +128,11 @@ class Ledger:
             "missed": end[3] - missed,
             "held_up": end[4] - held,
             "resident_KiB": resident,
-            "tick": _quantiles(whole),
-            "parts": {name: _quantiles(part) for (name, *_), part in zip(_PARTS, parts, strict=True)}
-            | {"rest": _quantiles(whole - sum(parts))},
-            "wake_up": _quantiles(self._late[: self._woken] / 1e3),
+            "tick": quantiles(whole),
+            "parts": {name: quantiles(part) for (name, *_), part in zip(_PARTS, parts, strict=True)}
+            | {"rest": quantiles(whole - sum(parts))},
+            "wake_up": quantiles(self._late[: self._woken] / 1e3),
         }
-
-
-def _quantiles(us: np.ndarray) -> dict[str, float]:
-    if not len(us):
-        return {"p50_us": math.nan, "p99_us": math.nan}
-    return {"p50_us": float(np.median(us)), "p99_us": float(np.percentile(us, 99))}
 
 
 def _allocate_shared(*shape: int) -> np.ndarray:

@@ -31,11 +31,7 @@ _IDLE = 0.1
 
 class _Child:
     """A module of this package in a process of its own, which prints a line when it is ready and one at its end. The last of
-    its arguments is its socket.
-
-    Attributes:
-        ready: ``wall_s`` and ``cpu_s`` from its start to its first line.
-    """
+    its arguments is its socket. ``ready``: ``wall_s`` and ``cpu_s`` from its start to its first line."""
 
     def __init__(self, module: str, *arguments, environment: dict | None = None):
         *words, bus = arguments
@@ -77,12 +73,9 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
     installed, cyclictest.
 
     ``kernels`` is the library that the daemon uses; empty: it uses numba; None: what it would use by itself. ``share``: file
-    in which it shares its estimates.
-
-    Returns:
-        The figures that `bench.daemon` prints; under ``answers`` those that `bench.car` prints; ``empty_loop``;
-        ``cyclictest``, None where it is missing; and ``ready``: the daemon's start in ``wall_s`` and ``cpu_s``.
-    """
+    in which it shares its estimates. Returns the figures that `bench.daemon` prints; under ``answers`` those that `bench.car`
+    prints; ``empty_loop``; ``cyclictest``, None where it is missing; and ``ready``: the daemon's start in ``wall_s`` and
+    ``cpu_s``."""
     ours, theirs = connected_sockets()
     car = _Child("car", corners, seconds, _CAR_PRIORITY, theirs)
     daemon = None
@@ -104,6 +97,12 @@ def measure_loop(corners: int, seconds: float, kernels: str | None = None, share
         theirs.close()
     figures = {"corners": corners, "seconds": seconds, "ready": daemon.ready}
     return figures | result | {"answers": answers, "cyclictest": latency}
+
+
+def quantiles(us: np.ndarray) -> dict[str, float]:
+    """Median and 99th percentile; NaN of nothing."""
+    median, tail = np.percentile(us, (50, 99)) if len(us) else (np.nan, np.nan)
+    return {"p50_us": float(median), "p99_us": float(tail)}
 
 
 def is_held_up(late_ns: int, worked_ns: int) -> bool:
@@ -133,16 +132,12 @@ def cyclictest(seconds: float) -> dict[str, float] | None:
         return None
     counts = [line.split() for line in output.splitlines() if line[:1].isdigit()]
     latency = np.repeat([int(us) for us, _ in counts], [int(count) for _, count in counts])
-    if not len(latency):
-        return None
-    return {"p50_us": float(np.median(latency)), "p99_us": float(np.percentile(latency, 99)), "ticks": len(latency)}
+    return quantiles(latency) | {"ticks": len(latency)} if len(latency) else None
 
 
 def machine() -> str:
     """Processor, cores and kernel, for the table's heading."""
-    model = "unknown processor"
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.lower().startswith("model name"):
-            model = line.partition(":")[2].strip()
-            break
-    return f"{model}, {os.cpu_count()} CPUs, Linux {os.uname().release}, CPython {sys.version.split()[0]}"
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    models = (line.partition(":")[2].strip() for line in lines if line.lower().startswith("model name"))
+    model, python = next(models, "unknown processor"), sys.version.split()[0]
+    return f"{model}, {os.cpu_count()} CPUs, Linux {os.uname().release}, CPython {python}"

@@ -8,8 +8,7 @@ def verdict(result: dict[str, Any]) -> list[dict[str, Any]]:
     """Each budget: ``measured``, ``limit``, ``unit``, and ``met``, whether the machine holds it.
 
     ``sense`` says which side of the limit is good, ``margin`` the distance to it, as a share of the limit. A figure that could
-    not be measured is NaN and not met.
-    """
+    not be measured is NaN and not met."""
     return [
         {
             "budget": name,

@@ -67,11 +67,8 @@ def curve_at(curves: tuple[Curve, ...], pad_thickness_mm: float) -> np.ndarray:
 
     The reciprocal of each coefficient is linear between measured thicknesses, and beyond them by at most half the nearest
     interval: pads and caliper are compliances in series, so compliance grows linearly with thickness. If a coefficient changes
-    its sign between the two thicknesses, all coefficients are interpolated linearly instead.
-
-    Raises:
-        InputError: the thickness is too far from the measured ones.
-    """
+    its sign between the two thicknesses, all coefficients are interpolated linearly instead. Raises InputError: the thickness
+    is too far from the measured ones."""
     if len(curves) == 1:
         return curves[0].of_all_terms
     low, high = thickness_range(curves)

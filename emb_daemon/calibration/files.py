@@ -39,7 +39,6 @@ def date_of_today() -> str:
 
 
 def dump_calibration(calibration: Calibration) -> str:
-    """The file's text."""
     return yaml.dump(msgspec.to_builtins(calibration), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
 
 

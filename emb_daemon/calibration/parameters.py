@@ -79,21 +79,15 @@ _EFFECTS = {effect.name: {parameter.name: parameter for parameter in effect.para
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a calibration.
+    """One number of a calibration."""
 
-    Attributes:
-        key: its path in the file.
-        value: present value, in ``unit``; of an effect that is switched off, the value that switching it on would set.
-        step: for numerical derivatives, in ``unit``; positive at any value, zero included.
-        relative: whether the step is a share of the value. It is not if the value is small compared with its usual size, nor
-            for positions and effects, for which zero is an ordinary value.
-        low, high: bounds that the file accepts, in ``unit``.
-    """
-
-    key: str
-    value: float
-    step: float
+    key: str  #: its path in the file
+    value: float  #: present value, in ``unit``; of an effect that is switched off, the value that switching it on would set
+    step: float  #: for numerical derivatives, in ``unit``; positive at any value, zero included
+    #: Whether the step is a share of the value. It is not if the value is small compared with its usual size, nor for
+    #: positions and effects, for which zero is an ordinary value.
     relative: bool
+    #: ``low`` and ``high``: bounds that the file accepts, in ``unit``.
     low: float
     high: float
     unit: str
@@ -124,14 +118,10 @@ def value_of(calibration: Calibration, key: str) -> float:
 def moved(calibration: Calibration, values: Mapping[str, float], *, checked: bool = False) -> Calibration:
     """The calibration with the numbers at ``values``' keys set, in the keys' units.
 
-    An effect that is switched off is switched on, its amplitudes at zero and its shapes at their usual sizes where
-    ``values`` does not set them. Unless ``checked``, the caller checks bounds and cross-checks, because a fit calls this
-    often.
-
-    Raises:
-        InputError: no number has a key; names near ones.
-        InputErrors: ``checked``, and the result is not what a calibration file may hold; lists every fault.
-    """
+    An effect that is switched off is switched on, its amplitudes at zero and its shapes at their usual sizes where ``values``
+    does not set them. Unless ``checked``, the caller checks bounds and cross-checks, because a fit calls this often. Raises
+    InputError: no number has a key; names near ones. Raises InputErrors: ``checked``, and the result is not what a calibration
+    file may hold; lists every fault."""
     numbers = [float(value) for value in values.values()]
     try:
         changed = _set(calibration, _tree(tuple(values)), numbers) if values else calibration

@@ -84,8 +84,7 @@ class _Reader:
     def convert(self, node: yaml.Node, kind: Any, path: str) -> Any:
         """``node`` as ``kind``; None after a fault, which is then recorded.
 
-        A struct's ``__post_init__`` may find several faults: one line each of its ValueError, ``key: what was expected``.
-        """
+        A struct's ``__post_init__`` may find several faults: one line each of its ValueError, ``key: what was expected``."""
         optional, kind = _strip_optional(kind)
         if optional and isinstance(node, yaml.ScalarNode) and node.value in ("null", "~", ""):
             return None

@@ -50,7 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
             _show(store.current)
         else:
             for entry in store.history:
-                _line(entry)
+                note = f" ({entry.note})" if entry.note else ""
+                print(f"  {entry.date}  {entry.outcome}{note}: {_figures(entry)}")
     if not found:
         print(f"{folder}: nothing learned")
     return 0
@@ -77,11 +78,6 @@ def _show(entry) -> None:
         sigma = f" ± {entry.sigmas[key]:.2g}" if key in entry.sigmas else ""
         print(f"  {key:40} {value:.6g}{sigma}")
     print(f"  evidence: {_figures(entry)}")
-
-
-def _line(entry) -> None:
-    note = f" ({entry.note})" if entry.note else ""
-    print(f"  {entry.date}  {entry.outcome}{note}: {_figures(entry)}")
 
 
 def _figures(entry) -> str:

@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 from emb_daemon.cli.options import CALIBRATION_HELP, add_mapping_argument, add_path, check_output, load_chosen
 from emb_daemon.cli.progress import progress
@@ -88,7 +87,8 @@ def _replay(arguments: argparse.Namespace) -> int:
     root, calibration = arguments.data.absolute(), load_chosen(arguments.calibration)
     drives, makers = dataset.drives(root), dataset.made_by(calibration)
     left = [d for d in drives if not (arguments.resume and replaying.is_replayed(root, d, makers))]
-    done = _work(arguments, "replaying", partial(replaying.replay_drive, root, calibration=calibration), left, _fault)
+    task = partial(replaying.replay_drive, root, calibration=calibration)
+    done = _work(arguments, "replaying", task, left, lambda _, reason: reason)
     faults = [text for text in done if isinstance(text, str)]
     seconds = sum(figures["seconds"] for figures in done if not isinstance(figures, str))
     print(f"{len(done) - len(faults)} of {len(drives)} drives replayed, {seconds / 3600.0:.2f} h")
@@ -99,10 +99,6 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _print_faults(texts: list[str]) -> None:
     for text in texts:
         tell(f"  {text}")
-
-
-def _fault(_item: Any, reason: str) -> str:
-    return reason
 
 
 def _diagnose(arguments: argparse.Namespace) -> int:
@@ -151,7 +147,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     root, calibration = arguments.data.absolute(), load_chosen(arguments.calibration)
     groups = list(dataset.by_unit(dataset.drives(root)).values())
     task = partial(learning.learn_unit, root, calibration=calibration, resume=arguments.resume)
-    done = _work(arguments, "learning", task, groups, _fault)
+    done = _work(arguments, "learning", task, groups, lambda _, reason: reason)
     learned = [result for result in done if not isinstance(result, str)]
     print(f"{len(learned)} units, {sum(result['trainings'] for result in learned)} trainings accepted")
     _print_faults([text for text in done if isinstance(text, str)])

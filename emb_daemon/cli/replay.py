@@ -6,15 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from emb_daemon.cli.options import (
-    CALIBRATION_HELP,
-    LOG_HELP,
-    add_mapping_argument,
-    add_path,
-    check_output,
-    load_chosen,
-    log_reader,
-)
+from emb_daemon.cli import options
 from emb_daemon.errors import InputError, tell
 from emb_daemon.estimator.status import TABLE
 
@@ -24,27 +16,25 @@ EXAMPLE = "emb-daemon replay stop.log.gz --calibration config/calibration.yaml -
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_path(parser, "logs", LOG_HELP, "LOG", nargs="+")
-    add_path(parser, "--calibration", CALIBRATION_HELP)
-    add_mapping_argument(parser)
+    options.add_path(parser, "logs", options.LOG_HELP, "LOG", nargs="+")
+    options.add_path(parser, "--calibration", options.CALIBRATION_HELP)
+    options.add_mapping_argument(parser)
     parser.add_argument("--corner", default="FL", help="FL, FR, RL or RR (default FL), or all: every corner in the log")
-    for option, name, default, help in (
-        ("--from", "start_s", 0.0, "give results from this time on"),
-        ("--to", "end_s", float("inf"), "stop at this time"),
-    ):
-        help += ", seconds of each log"
-        parser.add_argument(option, dest=name, type=float, default=default, metavar="S", help=help)
+    time = {"type": float, "metavar": "S"}
+    begin = "give results from this time on, seconds of each log"
+    parser.add_argument("--from", dest="start_s", default=0.0, help=begin, **time)
+    parser.add_argument("--to", dest="end_s", default=float("inf"), help="stop at this time, seconds of each log", **time)
     parser.add_argument(
         "--pad-thickness", type=float, metavar="MM", help="thickness of the mounted pads, if not that of the calibration"
     )
     parser.add_argument(
         "--measured-torque", action="store_true", help="use the rig's brake torque sensor for the heat model (a car has none)"
     )
-    add_path(parser, "--state", "adapt: read learned values from DIR, learn, and store them there", "DIR")
-    add_path(parser, "--keys", "accept only authentic frames, and authenticate those of --output")
+    options.add_path(parser, "--state", "adapt: read learned values from DIR, learn, and store them there", "DIR")
+    options.add_path(parser, "--keys", "accept only authentic frames, and authenticate those of --output")
     frames = "the frames that the daemon would have sent as .log, .blf, .asc, .trc or .mf4"
-    add_path(parser, "--output", f"estimates as .csv, .parquet or .signals.mf4, or {frames}")
-    add_path(parser, "--report", "write an HTML report: forces, errors, temperatures, events", "FILE.html")
+    options.add_path(parser, "--output", f"estimates as .csv, .parquet or .signals.mf4, or {frames}")
+    options.add_path(parser, "--report", "write an HTML report: forces, errors, temperatures, events", "FILE.html")
     parser.add_argument("--json", action="store_true", help="print error figures as JSON")
 
 
@@ -56,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     _check(arguments)
     calibration = _calibration(arguments)
-    read, sign = log_reader(arguments.mapping), np.asarray
+    read, sign = options.log_reader(arguments.mapping), np.asarray
     if arguments.keys:
         read, sign = _secure(arguments, read)
     replay = Replay(
@@ -96,7 +86,7 @@ def _calibration(arguments: argparse.Namespace):
     """The calibration with the mounted pads; prints to stderr if it is that of another actuator, or not of a brake."""
     from emb_daemon.calibration.parameters import moved
 
-    calibration = load_chosen(arguments.calibration)
+    calibration = options.load_chosen(arguments.calibration)
     if arguments.pad_thickness is not None:
         calibration = moved(calibration, {"pad_thickness_mm": arguments.pad_thickness}, checked=True)
     if not calibration.contact.is_in_reach:
@@ -117,10 +107,9 @@ def _warn_of_other_motor(results, motor):
 
     for result in results:
         samples = result.samples
-        for line in other_motor(samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2) or other_current(
-            samples, result.force_N, motor
-        ):
-            tell(f"{result.path}: {CORNERS[result.samples['corner'][0]]}: {line}")
+        lines = other_motor(samples, motor.torque_constant_Nm_per_A, motor.inertia_kg_m2)
+        for line in lines or other_current(samples, result.force_N, motor):
+            tell(f"{result.path}: {CORNERS[samples['corner'][0]]}: {line}")
 
 
 def _secure(arguments: argparse.Namespace, read):
@@ -142,7 +131,6 @@ def _secure(arguments: argparse.Namespace, read):
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Check the arguments before the work."""
     from emb_daemon.logs.write import FRAME_ENDINGS, TABLE_ENDINGS, ending_of
     from emb_daemon.replay import ALL
 
@@ -152,9 +140,9 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InputError(f"--from {start_s:g} --to {end_s:g}: expected 0 or more, and --to after --from")
     inputs = (*arguments.logs, arguments.calibration, arguments.mapping)
     if output:
-        check_output(output, inputs, TABLE_ENDINGS + FRAME_ENDINGS)
+        options.check_output(output, inputs, TABLE_ENDINGS + FRAME_ENDINGS)
     if report:
-        check_output(report, inputs)
+        options.check_output(report, inputs)
     if report and arguments.corner == ALL:
         raise InputError(f"--report: shows one corner; expected --corner FL, FR, RL or RR instead of {ALL}")
     if output and ending_of(output) in FRAME_ENDINGS:

@@ -73,10 +73,12 @@ def _open_bus(arguments: argparse.Namespace, corners: tuple[str, ...]):
     sent, heard = load_links(corners=corners) if arguments.keys else ([], [])
     ids += [can_id for link in heard for can_id in (link.authentication_id, link.freshness_id)]
     if arguments.mapping:
+        from emb_daemon.logs.live import open_buses
         from emb_daemon.logs.mapping import Mapping
-        from emb_daemon.logs.simulated import open_simulated
+        from emb_daemon.logs.simulated import SimulatedRig
 
-        return open_simulated(bus_options(arguments), Mapping(arguments.mapping), ids)
+        mapping = Mapping(arguments.mapping)
+        return SimulatedRig(open_buses(bus_options(arguments), mapping), mapping, ids)
     bus = open_bus(**bus_options(arguments), ids=ids)
     if not arguments.keys:
         return bus

@@ -3,15 +3,7 @@
 import argparse
 import sys
 
-from emb_daemon.cli.options import (
-    CONFIG_HELP,
-    add_bus_arguments,
-    add_id_arguments,
-    add_path,
-    add_share_argument,
-    bus_options,
-    check_ids,
-)
+from emb_daemon.cli import options
 from emb_daemon.cli.serving import serve
 from emb_daemon.errors import InputError
 
@@ -19,13 +11,13 @@ EXAMPLE = "emb-daemon uds --config /etc/emb_daemon/emb.yaml -i socketcan -c can0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_path(parser, "--config", CONFIG_HELP, required=True)
+    options.add_path(parser, "--config", options.CONFIG_HELP, required=True)
     default = "$STATE_DIRECTORY, the configuration's, or /var/lib/emb_daemon"
     state = f"the daemon's state directory; trouble codes are stored there too (default: {default})"
-    add_path(parser, "--state", state, "DIR")
-    add_share_argument(parser)
-    add_id_arguments(parser, 0x710, 0x718)
-    add_bus_arguments(parser)
+    options.add_path(parser, "--state", state, "DIR")
+    options.add_share_argument(parser)
+    options.add_id_arguments(parser, 0x710, 0x718)
+    options.add_bus_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -37,11 +29,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     configuration = Setup(arguments.config).configuration
     listened = broadcast_ids()
-    check_ids(arguments, listened)
+    options.check_ids(arguments, listened)
     state = arguments.state or state_directory(configuration.state_directory or "/var/lib/emb_daemon", arguments.config.parent)
     if not state.is_dir():
         raise InputError(f"{state}: no such state directory; give it with --state")
-    bus = open_bus(**bus_options(arguments, configuration.bus), ids=[*listened, arguments.request_id])
+    bus = open_bus(**options.bus_options(arguments, configuration.bus), ids=[*listened, arguments.request_id])
     try:
         diagnostics = Diagnostics(bus, arguments.config, state, arguments.request_id, arguments.response_id, arguments.share)
         if diagnostics.memory.warning:

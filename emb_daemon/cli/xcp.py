@@ -2,16 +2,7 @@
 
 import argparse
 
-from emb_daemon.cli.options import (
-    CONFIG_HELP,
-    add_bus_arguments,
-    add_id_arguments,
-    add_path,
-    add_share_argument,
-    bus_options,
-    check_ids,
-    host_and_port,
-)
+from emb_daemon.cli import options
 from emb_daemon.cli.serving import serve
 
 EXAMPLE = (
@@ -21,8 +12,8 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_path(parser, "--config", CONFIG_HELP, required=True)
-    add_share_argument(parser)
+    options.add_path(parser, "--config", options.CONFIG_HELP, required=True)
+    options.add_share_argument(parser)
     transport = parser.add_mutually_exclusive_group(required=True)
     transport.add_argument(
         "--udp",
@@ -32,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     transport.add_argument(
         "--can", action="store_true", help="answer on CAN, on the bus of the options below or of the configuration"
     )
-    add_id_arguments(parser, 0x720, 0x728)
-    add_bus_arguments(parser)
+    options.add_id_arguments(parser, 0x720, 0x728)
+    options.add_bus_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -59,7 +50,7 @@ def _udp(text: str):
     from emb_daemon.workshop.ifdata import over_udp
     from emb_daemon.workshop.measure import Udp
 
-    host, port = host_and_port(text)
+    host, port = options.host_and_port(text)
     transport = Udp(host, port)
     return transport, over_udp(host, transport.port), f"UDP {host}:{transport.port}"
 
@@ -72,8 +63,8 @@ def _can(arguments: argparse.Namespace, setup):
     from emb_daemon.workshop.measure import Can
 
     layout = setup.layout[0]
-    check_ids(arguments, {*layout["sent_id"].ravel().tolist(), *np.flatnonzero(layout["slot"] != -1).tolist()})
-    options = bus_options(arguments, setup.configuration.bus)
-    transport = Can(open_bus(**options, ids=[arguments.request_id]), arguments.request_id, arguments.response_id)
-    connection = over_can(arguments.request_id, arguments.response_id, options["bitrate"])
+    options.check_ids(arguments, {*layout["sent_id"].ravel().tolist(), *np.flatnonzero(layout["slot"] != -1).tolist()})
+    of_bus = options.bus_options(arguments, setup.configuration.bus)
+    transport = Can(open_bus(**of_bus, ids=[arguments.request_id]), arguments.request_id, arguments.response_id)
+    connection = over_can(arguments.request_id, arguments.response_id, of_bus["bitrate"])
     return transport, connection, f"CAN {arguments.request_id:#x}, {arguments.response_id:#x}"

@@ -21,23 +21,16 @@ _FRAMES_PER_CYCLE = 6
 
 @dataclass(frozen=True)
 class Comparison:
-    """One corner's estimates, with the truth of the samples that they refer to.
+    """One corner's estimates, with the truth of the samples that they refer to."""
 
-    Attributes:
-        time_s: of the samples, from the start; shape (n,), as all below.
-        force_N, sigma_N, true_N: estimate, its standard deviation, simulated truth.
-        response_s: from a sample's frames on the bus to its estimate on the bus.
-        usable: the estimate's Status was not NotAvailable or Fault.
-        samples: number of resolver samples that reached the bus.
-    """
-
-    time_s: np.ndarray
+    time_s: np.ndarray  #: of the samples, from the start; shape (n,), as all below
+    #: ``force_N``, ``sigma_N`` and ``true_N``: estimate, its standard deviation, simulated truth.
     force_N: np.ndarray
     sigma_N: np.ndarray
     true_N: np.ndarray
-    response_s: np.ndarray
-    usable: np.ndarray
-    samples: int
+    response_s: np.ndarray  #: from a sample's frames on the bus to its estimate on the bus
+    usable: np.ndarray  #: the estimate's Status was not NotAvailable or Fault
+    samples: int  #: number of resolver samples that reached the bus
 
     def figures(self) -> dict[str, float]:
         """Error figures in N over the usable estimates, and the share of them within two sigma."""

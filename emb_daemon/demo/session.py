@@ -49,16 +49,8 @@ class _LastMessages(logging.Handler):
 
 
 class Session:
-    """One demonstration.
-
-    Args:
-        corners: 1 to 4, FL first.
-        seconds: length of the drive.
-
-    Attributes:
-        recorder: truth and broadcasts.
-        daemon, live: the daemon and the car, for their counts.
-    """
+    """One demonstration, a drive of ``seconds`` with 1 to 4 corners, FL first. ``recorder``: truth and broadcasts; ``daemon``,
+    ``live``: the daemon and the car, for their counts."""
 
     def __init__(self, corners: int, seconds: float):
         self.seconds = seconds
@@ -75,7 +67,6 @@ class Session:
         self._failures: list[BaseException] = []
 
     def warm_up(self) -> None:
-        """Compile, or load from the cache."""
         self.daemon.warm_up()
         self.live.warm_up()
         self.recorder.compare(0)
@@ -149,7 +140,6 @@ def _summary(session: Session) -> None:
 
 
 def _run_with_view(session: Session, console: "Console", messages: deque[str]) -> None:
-    """On a terminal."""
     from rich.live import Live
 
     from emb_daemon.demo.view import render

@@ -63,14 +63,10 @@ def comparison(before: EpisodeErrors, after: EpisodeErrors) -> dict[str, dict[st
     weights = random.multinomial(count, np.full(count, 1.0 / count), _RESAMPLES)
     result: dict = {}
     for path in before.paths:
-        part = {c: _compare(before, after, path, c, weights) for c in before.conditions if _is_known(before, after, path, c)}
-        if "total" in part:
-            result[path] = part
+        known = [c for c in before.conditions if np.isfinite(before.rmse(path, c) + after.rmse(path, c))]
+        if "total" in known:
+            result[path] = {condition: _compare(before, after, path, condition, weights) for condition in known}
     return result
-
-
-def _is_known(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str) -> bool:
-    return bool(np.isfinite(before.rmse(path, condition)) and np.isfinite(after.rmse(path, condition)))
 
 
 def _compare(before: EpisodeErrors, after: EpisodeErrors, path: str, condition: str, weights: np.ndarray) -> dict:

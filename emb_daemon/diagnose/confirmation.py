@@ -44,10 +44,8 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
     if selection.instead is None:
         return confirmed
     alone = _confirmed(selection.instead, judges)
-    (made, named), terms = (
-        (_left(s, judges) for s, _ in (confirmed, alone)),
-        [c for c in selection.candidates.values() if c.made],
-    )
+    made, named = _left(confirmed[0], judges), _left(alone[0], judges)
+    terms = [c for c in selection.candidates.values() if c.made]
     if all(made[c.channel] < named[c.channel] for c in terms if c.accepted and c.channel in made):
         return confirmed
     worse = "effects of the catalogue alone leave less of left-out episodes and validation logs"
@@ -80,8 +78,7 @@ def _left(selection: Selection, judges: Bench | None) -> dict[str, float]:
 def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, EpisodeErrors]:
     """The selection without everything that makes the running estimator worse.
 
-    Returns it with the errors on left-out episodes.
-    """
+    Returns it with the errors on left-out episodes."""
     bench, recalibrated = selection.model.bench, selection.recalibrated
     before, main, held = errors(bench, bench.calibration), whole(bench), bench.residuals({})
     withdrawn: list[str] = []
@@ -110,11 +107,7 @@ def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, E
 
 
 def _against(
-    selection: Selection,
-    judges: Bench | None,
-    before: EpisodeErrors,
-    after: EpisodeErrors,
-    held: Mapping[str, np.ndarray],
+    selection: Selection, judges: Bench | None, before: EpisodeErrors, after: EpisodeErrors, held: Mapping[str, np.ndarray]
 ) -> tuple[str, str] | None:
     """The suspect against which left-out episodes speak most, with the reason in words; ``held``: residuals before by channel,
     N.

@@ -38,32 +38,22 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class Coordinate:
-    """One number that a fit moves.
+    """One number that a fit moves."""
 
-    Attributes:
-        name: key of the calibration that it stands for.
-        channel: residual that it is read from.
-        start: its value as calibrated; zero for an effect that is off.
-        step: of the numerical derivative.
-        prior: standard deviation of what is known beforehand, about the start; infinite for a new effect's amplitude.
-        unmeasured: whether what is known beforehand was only stated, and may be of another unit or place (`known_to`).
-        moves: keys that follow it. Several coordinates of one key add up.
-        effect, parameter: what it belongs to; empty for a base parameter.
-        log: index of the only log that it acts on, or None for all.
-    """
-
-    name: str
-    channel: str
-    start: float
-    step: float
-    prior: float
-    moves: tuple[Move, ...]
+    name: str  #: key of the calibration that it stands for
+    channel: str  #: residual that it is read from
+    start: float  #: its value as calibrated; zero for an effect that is off
+    step: float  #: of the numerical derivative
+    prior: float  #: standard deviation of what is known beforehand, about the start; infinite for a new effect's amplitude
+    moves: tuple[Move, ...]  #: keys that follow it. Several coordinates of one key add up.
     low: float = -np.inf
     high: float = np.inf
     unit: str = "1"
+    #: ``effect`` and ``parameter``: what it belongs to; empty for a base parameter.
     effect: str = ""
     parameter: str = ""
-    log: int | None = None
+    log: int | None = None  #: index of the only log that it acts on, or None for all
+    #: Whether what is known beforehand was only stated, and may be of another unit or place (`known_to`).
     unmeasured: bool = False
 
     def known_to(self, value: float, centre: float | None = None) -> float:
@@ -246,12 +236,9 @@ def effect_coordinates(
 
 @lru_cache(256)
 def _moves(coordinates: tuple[Coordinate, ...], log: int | None) -> tuple[dict[str, int], np.ndarray, np.ndarray]:
-    """How keys follow coordinates on a log, or on all.
-
-    Returns:
-        (position of each key; positions of key and coordinate, and weight, of each move, shape (3, moves); number of
-        coordinates of single logs, lowest and highest of each key, shape (3, keys)).
-    """
+    """How keys follow coordinates on a log, or on all. Returns (position of each key; positions of key and coordinate, and
+    weight, of each move, shape (3, moves); number of coordinates of single logs, lowest and highest of each key, shape (3,
+    keys))."""
     places: dict[str, int] = {}
     moves, limits = [], {}
     for column, coordinate in enumerate(coordinates):
@@ -265,12 +252,8 @@ def _moves(coordinates: tuple[Coordinate, ...], log: int | None) -> tuple[dict[s
 
 
 def by_key(values: Values, middle: float, log: int | None = None) -> dict[str, float]:
-    """What coordinates say of the calibration's numbers.
-
-    Args:
-        middle: motor angle in rad about which harmonics are fitted, see `about_middle`.
-        log: only what acts on this log; None: what acts on single logs counts with its mean.
-    """
+    """What coordinates say of the calibration's numbers. ``middle``: motor angle in rad about which harmonics are fitted, see
+    `about_middle`. With a ``log`` only what acts on that; without, what acts on single logs counts with its mean."""
     places, (key, column, weight), (of_logs, lowest, highest) = _moves(tuple(values), log)
     moved_by = weight * np.fromiter(values.values(), float, len(values))[column.astype(int)]
     sums = np.bincount(key.astype(int), moved_by, len(places)) / np.maximum(of_logs, 1.0)
@@ -287,8 +270,7 @@ def about_middle(values: Values, middle: float) -> dict[Coordinate, float]:
     """Values as the calibration states them, with its harmonics as they are fitted.
 
     The motor angle counts from anywhere, so a small change of an order would turn the phase by much. Fits therefore move
-    cosine and sine over the angle from the ``middle`` of those that occur.
-    """
+    cosine and sine over the angle from the ``middle`` of those that occur."""
     result, named = dict(values), {c.name: c for c in values}
     for order, cosine, sine, _ in _HARMONICS:
         if order in named:

@@ -77,40 +77,29 @@ class Recalibrated:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything that the report shows.
+    """Everything that the report shows."""
 
-    Attributes:
-        calibration: the augmented one.
-        selection: what the search chose.
-        findings: one for each effect of the catalogue, accepted ones first.
-        recalibrated: base parameters, by key.
-        before, after: errors of the running estimator on what ``judged_on`` says.
-        validated: RMS by which each finding lowers its channel's residual on the validation logs.
-        judged_residual: (before, after) RMS of each channel's residual on the validation logs.
-        left: what is left, by channel.
-        withdrawn: names of what the fit logs prove and confirmation took out again.
-        outside: where the validation logs leave the range in which a term was found.
-        plain: RMS (N) that a plain fit to the same logs (`plain`) leaves of the torque path where it is judged, and that this
-            calibration leaves there; None of a brake, and where no current was recorded.
-        reference_late_s: time by which the reference force came after angle and current, before it was judged at its own.
-    """
-
-    calibration: Calibration
+    calibration: Calibration  #: the augmented one
     bench: Bench
     judges: Bench
     judged_on: str
-    selection: Selection
-    findings: tuple[Candidate, ...]
-    recalibrated: Mapping[str, Recalibrated]
+    selection: Selection  #: what the search chose
+    findings: tuple[Candidate, ...]  #: one for each effect of the catalogue, accepted ones first
+    recalibrated: Mapping[str, Recalibrated]  #: base parameters, by key
+    #: ``before`` and ``after``: errors of the running estimator on what ``judged_on`` says.
     before: EpisodeErrors
     after: EpisodeErrors
-    validated: Mapping[str, float]
+    validated: Mapping[str, float]  #: RMS by which each finding lowers its channel's residual on the validation logs
+    #: (before, after) RMS of each channel's residual on the validation logs.
     judged_residual: Mapping[str, tuple[float, float]]
-    left: Mapping[str, Left]
-    withdrawn: tuple[str, ...]
-    outside: Sequence[Outside]
+    left: Mapping[str, Left]  #: what is left, by channel
+    withdrawn: tuple[str, ...]  #: names of what the fit logs prove and confirmation took out again
+    outside: Sequence[Outside]  #: where the validation logs leave the range in which a term was found
     seconds: float
+    #: RMS (N) that a plain fit to the same logs (`plain`) leaves of the torque path where it is judged, and that this
+    #: calibration leaves there; None of a brake, and where no current was recorded.
     plain: tuple[float, float] | None = None
+    #: Time by which the reference force came after angle and current, before it was judged at its own.
     reference_late_s: float = 0.0
 
     @property
@@ -166,11 +155,8 @@ def diagnose(
     """Find what the calibration's models lack on ``fit_logs``, add it, and judge on ``validate``.
 
     Validation logs fit nothing, but have a veto, and a say where left-out episodes are asked whether the force got worse.
-    Without them the fit logs judge: each quarter of their episodes by parameters from the other three.
-
-    Raises:
-        InputError: the logs cannot tell anything (too short, no motion, no signal to judge by), or judge themselves.
-    """
+    Without them the fit logs judge: each quarter of their episodes by parameters from the other three. Raises InputError: the
+    logs cannot tell anything (too short, no motion, no signal to judge by), or judge themselves."""
     begin = time.monotonic()
     _refuse_same(fit_logs, validate)
     progress("cutting the logs into episodes", 0.02)
@@ -237,10 +223,9 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         augmented, after = found, errors(judges, found)
     final = judging.under(augmented).residuals({}) if judges else selection.model.residual
     judged_before = judging.residuals({})
-    logs = [trial.log for trial in bench.trials]
     made = [term for term in augmented.terms if term.name in selection.accepted]
     result = Diagnosis(
-        calibration=_with_provenance(augmented, selection, after, judged_on, logs),
+        calibration=_with_provenance(augmented, selection, after, judged_on),
         bench=bench,
         judges=judging,
         judged_on=judged_on,
@@ -302,9 +287,6 @@ def _refuse_silent(bench: Bench) -> None:
         f"{log.path}: no sample of it can be judged; expected motor, current and reference at 100 Hz or more, or slower "
         f"motion: its samples are {apart:.3g} ms apart"
     )
-
-
-# -- findings ---------------------------------------------------------------------------------------------------------
 
 
 def findings(selection: Selection) -> tuple[Candidate, ...]:
@@ -411,9 +393,6 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
             tolerated = TOLERATED.get(c.name, np.inf) if before and calibration.provenance else np.inf
             result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel, tolerated)
     return result
-
-
-# -- what is left -----------------------------------------------------------------------------------------------------
 
 
 def _left(
@@ -563,9 +542,6 @@ def _heat_dependences(selection: Selection, augmented: Calibration) -> list[Depe
     return dependences(CHANNEL_OF_HEAT, HeatSearch(model).dependence(), model.counted(CHANNEL_OF_HEAT), floor)
 
 
-# -- the calibration --------------------------------------------------------------------------------------------------
-
-
 def undecided(selection: Selection) -> dict[str, float]:
     """RMS difference between accepted terms and those that are as likely, as a share of the clamp force, by the key of the
     noise that has to cover it; empty for a motor that turns free, whose force is zero."""
@@ -654,9 +630,7 @@ def _with_memory(term: Term, bench: Bench, calibration: Calibration) -> Term:
     return msgspec.structs.replace(term, memory_low=low, memory_high=high) if low < high else term
 
 
-def _with_provenance(
-    calibration: Calibration, selection: Selection, after: EpisodeErrors, judged_on: str, logs: Sequence[Log]
-) -> Calibration:
+def _with_provenance(calibration: Calibration, selection: Selection, after: EpisodeErrors, judged_on: str) -> Calibration:
     old = calibration.provenance
     sigmas, figures = (dict(old.sigmas), dict(old.figures)) if old else ({}, {})
     for c in selection.applied():
@@ -665,11 +639,8 @@ def _with_provenance(
         if weight and np.isfinite(sigma) and not c.name.startswith("terms["):
             sigmas[c.name] = float(sigma * weight)
     figures |= {f"diagnose.{judged_on}.{path}_rmse_N": after.rmse(path) for path in after.paths}
-    sources = tuple(
-        Source(log=log.path.name, sha256=hashlib.sha256(log.path.read_bytes()).hexdigest())
-        for log in logs
-        if log.path.is_file()
-    )
+    paths = [trial.log.path for trial in selection.model.bench.trials if trial.log.path.is_file()]
+    sources = tuple(Source(log=path.name, sha256=hashlib.sha256(path.read_bytes()).hexdigest()) for path in paths)
     provenance = Provenance(
         date=date_of_today(),
         tool=f"emb-daemon diagnose {__version__}",

@@ -27,13 +27,7 @@ _NOISE_SAMPLES = 5
 
 
 def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Number of the episode that each sample belongs to, ascending from 0.
-
-    Args:
-        time_s: sample times, shape (N,).
-        force_N: clamp force, measured or estimated, shape (N,).
-        angle_rad: motor angle, shape (N,).
-    """
+    """Number of the episode that each sample belongs to, ascending from 0; ``force_N``: measured or estimated."""
     if not len(time_s):
         return np.zeros(0, np.int64)
     longest = float(np.clip((time_s[-1] - time_s[0]) / _PIECES, _SHORTEST_S, _LONGEST_S))
@@ -57,13 +51,7 @@ def episodes(time_s: np.ndarray, force_N: np.ndarray, angle_rad: np.ndarray) -> 
 
 def by_turns(episode: np.ndarray, time_s: np.ndarray, wheel_rad: np.ndarray) -> np.ndarray:
     """The same episodes, long ones cut after whole turns of the disc: an error that lasts throughout a hold is the same at
-    every angle of the disc, so that what follows that angle has been seen anew in each part.
-
-    Args:
-        episode: number of each sample's episode, ascending from 0, shape (N,).
-        time_s: sample times, shape (N,).
-        wheel_rad: angle of the wheel, unwrapped, shape (N,).
-    """
+    every angle of the disc, so that what follows that angle has been seen anew in each part. ``wheel_rad``: unwrapped."""
     cuts = np.zeros(len(episode), np.int64)
     begins = np.flatnonzero(np.diff(episode, prepend=-1))
     for start, stop in pairwise([*begins.tolist(), len(episode)]):

@@ -17,12 +17,8 @@ from emb_daemon.jit import njit
 
 class Averaging:
     """Means over runs of neighbouring samples, none across episodes, weighted so that a sum of squares stays one of samples.
-
-    Attributes:
-        episode: of each mean.
-        told: one for each sample that counts, else zero, shape (N,).
-        per_mean: what makes a weighted mean of a sum, and a plain mean of a weighted one, shape (means,).
-    """
+    ``episode``: of each mean; ``told``: one for each sample that counts, else zero, shape (N,); ``per_mean``: what makes a
+    weighted mean of a sum, and a plain mean of a weighted one, shape (means,)."""
 
     def __init__(self, episode: np.ndarray, samples: int, told: np.ndarray | None = None):
         """``episode`` (N,) ascending; ``samples`` in a run, of which those that are ``told`` (N,) count, or all."""
@@ -59,15 +55,10 @@ def _sum_products(column, factor, starts, sums, index):
 
 @dataclass(frozen=True)
 class Moments:
-    """Second moments of regressors and residual, one matrix for each episode: all that the statistics below need.
+    """Second moments of regressors and residual, one matrix for each episode: all that the statistics below need."""
 
-    Attributes:
-        products: shape (episodes, columns + 1, columns + 1); the residual is the last column.
-        counts: samples in each episode.
-    """
-
-    products: np.ndarray
-    counts: np.ndarray
+    products: np.ndarray  #: shape (episodes, columns + 1, columns + 1); the residual is the last column
+    counts: np.ndarray  #: samples in each episode
 
     @classmethod
     def of(cls, regressors: np.ndarray, residual: np.ndarray, episode: np.ndarray, episodes: int) -> "Moments":
@@ -93,19 +84,12 @@ class Moments:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Least squares with everything that leaving episodes out says of it.
+    """Least squares with everything that leaving episodes out says of it."""
 
-    Attributes:
-        values: estimates, shape (columns,).
-        covariance: by the jackknife over episodes.
-        left_out: squared error of each episode, predicted from all others, shape (episodes,).
-        without: estimates without each episode, shape (episodes, columns).
-    """
-
-    values: np.ndarray
-    covariance: np.ndarray
-    left_out: np.ndarray
-    without: np.ndarray
+    values: np.ndarray  #: estimates, shape (columns,)
+    covariance: np.ndarray  #: by the jackknife over episodes
+    left_out: np.ndarray  #: squared error of each episode, predicted from all others, shape (episodes,)
+    without: np.ndarray  #: estimates without each episode, shape (episodes, columns)
 
 
 def leave_out(moments: Moments, penalty: np.ndarray) -> LeftOut:
@@ -162,22 +146,14 @@ def leave_out_within(moments: Moments, penalty: np.ndarray, low: np.ndarray, hig
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the episodes say of a candidate.
+    """What the episodes say of a candidate."""
 
-    Attributes:
-        p_value: of "all its parameters are zero".
-        gain: fall of the squared error summed over left-out episodes.
-        agreement: ``gain`` as a share of what the error falls by where nothing is left out.
-        clusters: effective number of episodes that carry it.
-        values, sigmas: of its parameters.
-    """
-
-    p_value: float
-    gain: float
-    clusters: float
-    values: np.ndarray
+    p_value: float  #: of "all its parameters are zero"
+    gain: float  #: fall of the squared error summed over left-out episodes
+    clusters: float  #: effective number of episodes that carry it
+    values: np.ndarray  #: of its parameters, as ``sigmas``
     sigmas: np.ndarray
-    agreement: float = 0.0
+    agreement: float = 0.0  #: ``gain`` as a share of what the error falls by where nothing is left out
 
 
 #: Least agreement of episodes, so that turns of the disc count: what has another phase in each of 3 to 6 holds reaches it in 4

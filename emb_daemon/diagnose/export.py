@@ -84,12 +84,8 @@ def values(term: Term) -> dict[str, float]:
 
 
 def source(term: Term, maximum_force_N: float, equation: str) -> str:
-    """The effect file of a term.
-
-    Args:
-        maximum_force_N: of the calibration; a gate of load counts in it.
-        equation: the term as an engineer writes it.
-    """
+    """The effect file of a term. ``maximum_force_N`` of the calibration: a gate of load counts in it; ``equation``: as an
+    engineer writes it."""
     gate, kernel, words = _GATES[term.gate], _kernel(term), term.signal.replace("_", " ").capitalize()
     used, further = "\n".join(kernel), BEYOND * (term.high - term.low)
     functions = [name for name in ("cos", "exp", "sin") if f"{name}(" in used]
@@ -166,7 +162,6 @@ def _kernel(term: Term) -> list[str]:
 
 
 def _declaration(term: Term, equation: str) -> list[str]:
-    """The kernel's `Effect`."""
     return [
         "EFFECT = Effect(",
         f"    name={_literal(effect_name(term))},",

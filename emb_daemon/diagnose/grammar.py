@@ -309,7 +309,6 @@ def _called_by_name(selection: Selection, channel: str) -> Selection:
 
 
 def _place(made: Candidate) -> tuple[str, tuple[str, ...]]:
-    """Port and signals of a term."""
     return made.effect.hook, made.signals
 
 
@@ -417,8 +416,7 @@ def _is_longer(found: Selection, selection: Selection, channel: str) -> bool:
     little of what is left, most of all where the cause is small and has none of the forms.
 
     Not asked of machines that clamp nothing: by this rule five of 36 recordings lost a term that holds on other logs."""
-    clamps = selection.model.bench.clamps
-    return clamps and _is_shorter(selection, found, channel)
+    return selection.model.bench.clamps and _is_shorter(selection, found, channel)
 
 
 def _most_chosen(prospects: Sequence[Prospect], shares: Mapping[tuple[str, str], float]) -> list[Prospect]:
@@ -450,14 +448,12 @@ def _with(
     unsure, manoeuvre = _unsure(best.form.signals, alike)
     ceiling, rival = screening.rival(model, channel, {}, LASTING[channel])
     largest = _largest_beside(selection, best, channel)
+    small = model.rms(best.evidence.gain, channel) < _BESIDE * largest
     objections = {
         f"not significant over the whole grammar (q = {chance:.2g})": chance > Q_VALUE,
         f"a smooth function of {rival} explains much more: {SHADOW}": best.evidence.gain < OF_MODEL_FREE * ceiling,
         f"its placebo (its signal at another time) explains {100 * moved:.0f} % of the same": moved > OF_PLACEBO,
-        f"less than a tenth of the {largest:.3g} {UNITS[channel]} that another term does, whose shape is a guess": model.rms(
-            best.evidence.gain, channel
-        )
-        < _BESIDE * largest,
+        f"less than a tenth of the {largest:.3g} {UNITS[channel]} that another term does, whose shape is a guess": small,
     }
     against = next((text for text, holds in objections.items() if holds), "")
     candidate = Candidate(
@@ -470,9 +466,8 @@ def _with(
     if against:
         return selection.noted([candidate])
     if best.form.shape == "harmonic":
-        return _enter_lobe(
-            selection, candidate, [p for p in prospects if p.form.shape == "harmonic" and p.means == best.means]
-        )
+        lobes = [p for p in prospects if p.form.shape == "harmonic" and p.means == best.means]
+        return _enter_lobe(selection, candidate, lobes)
     return _enter(selection, candidate, best.form)
 
 
@@ -517,7 +512,6 @@ def _with_orders_again(selection: Selection, channel: str) -> Selection:
 
 
 def _made(selection: Selection, channel: str) -> list[str]:
-    """Terms that were accepted in a channel."""
     return [name for name, c in selection.candidates.items() if c.accepted and c.made and c.channel == channel]
 
 
@@ -588,8 +582,7 @@ def _lengths_fitted(
     selection: Selection, channel: str, fitted: Sequence[tuple[Prospect, Selection]], weights: np.ndarray
 ) -> np.ndarray:
     """Description length of what is left of left-out episodes, ``weights`` (k, episodes), once each is fitted, (fitted, k);
-    ``selection``: without any of them. What is too little to matter is nothing; not of heat, where what leaves least is taken.
-    """
+    ``selection``: without any. What is too little to matter is nothing; not of heat, where what leaves least is taken."""
     model, samples = selection.model, LASTING[channel]
     noise, matters = weights @ noise_left(model, channel, samples), NOTHING
     if channel != CHANNEL_OF_HEAT:

@@ -43,29 +43,22 @@ def rms_known(residual: np.ndarray, means: Averaging | None = None) -> float:
 
 @dataclass(frozen=True)
 class Model:
-    """Coordinates with their values, and the residual there.
-
-    Attributes:
-        values: of every coordinate that has been entered; effects' shapes included.
-        centre: where a coordinate's prior is centred, if not at the calibration: a shape is touched up about the start at
-            which it was chosen.
-        chosen: coordinates that stand as chosen and are not fitted: whole numbers.
-        residual: by channel.
-        heat: of each log (`held_heat.run_with_heat`); coordinates that stand at nothing do not change it.
-        columns: regressors, minus the derivative of the channel's residual, at the last fit.
-        stood: by channel, bench, values and heat of that: where nothing has moved since, a fit begins with them.
-        fits: by channel.
-    """
+    """Coordinates with their values, and the residual there."""
 
     bench: Bench
-    values: dict[Coordinate, float]
-    residual: dict[str, np.ndarray] = field(repr=False)
+    values: dict[Coordinate, float]  #: of every coordinate that has been entered; effects' shapes included
+    residual: dict[str, np.ndarray] = field(repr=False)  #: by channel
+    #: Of each log (`held_heat.run_with_heat`); coordinates that stand at nothing do not change it.
     heat: Sequence[np.ndarray | None] = field(repr=False)
+    #: Where a coordinate's prior is centred, if not at the calibration: a shape is touched up about the start at which it was
+    #: chosen.
     centre: Values = field(default_factory=dict)
-    chosen: frozenset[Coordinate] = frozenset()
+    chosen: frozenset[Coordinate] = frozenset()  #: coordinates that stand as chosen and are not fitted: whole numbers
+    #: Regressors, minus the derivative of the channel's residual, at the last fit.
     columns: Mapping[Coordinate, np.ndarray] = field(default_factory=dict, repr=False)
+    #: By channel, bench, values and heat of that: where nothing has moved since, a fit begins with them.
     stood: Mapping[str, tuple[Bench, Values, Sequence[np.ndarray | None]]] = field(default_factory=dict, repr=False)
-    fits: Mapping[str, Fit] = field(default_factory=dict, repr=False)
+    fits: Mapping[str, Fit] = field(default_factory=dict, repr=False)  #: by channel
 
     @classmethod
     def of(cls, bench: Bench) -> "Model":
@@ -119,8 +112,6 @@ class Model:
         left = {c: value for c, value in self.values.items() if c not in gone}
         residual, heat = self.bench.run(left)
         return replace(self, values=left, residual=residual, heat=heat, chosen=self.chosen - gone)
-
-    # -- fitting ------------------------------------------------------------------------------------------------------
 
     def noise(self, channel: str) -> float:
         """Mean square of the residual where there is one."""
@@ -246,8 +237,6 @@ class Model:
         centre = self.centre.get(coordinate, coordinate.start)
         return coordinate.known_to(self.values.get(coordinate, centre), centre)
 
-    # -- testing ------------------------------------------------------------------------------------------------------
-
     def penalty(self, coordinates: Sequence[Coordinate], channel: str) -> np.ndarray:
         """What priors add to the normal equations."""
         prior = np.array([self._known_to(c) for c in coordinates])
@@ -289,12 +278,7 @@ class Model:
         return leave_out(moments, self.penalty(free, channel)).left_out
 
     def evidence(
-        self,
-        channel: str,
-        own: Sequence[np.ndarray],
-        given: Sequence[np.ndarray] = (),
-        samples: int = 1,
-        turns: bool = False,
+        self, channel: str, own: Sequence[np.ndarray], given: Sequence[np.ndarray] = (), samples: int = 1, turns: bool = False
     ) -> Evidence:
         """Of regressors that are not in the model, everything in it and ``given`` ones free; of means over ``samples``.
 
@@ -323,10 +307,8 @@ class Model:
         start = {c: self.centre.get(c, c.start) for c in rest}
         restored = self.residual_at(channel, start | dict(values))
         first, penalty = len(rest), self.penalty([*rest, *tested], channel)
-        nuisances, (low, high) = (
-            list(range(first)),
-            np.array([(c.low - start[c], c.high - start[c]) for c in rest]).reshape(-1, 2).T,
-        )
+        nuisances = list(range(first))
+        low, high = np.array([(c.low - start[c], c.high - start[c]) for c in rest]).reshape(-1, 2).T
 
         def judged(turns: bool) -> Evidence:
             moments = self.moments(channel, [self.columns[c] for c in (*rest, *tested)], restored, samples, turns)

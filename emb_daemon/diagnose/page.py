@@ -116,15 +116,10 @@ def _evidence(report: Page, diagnosis: Diagnosis, finding: Candidate) -> None:
     applied = (signals["clamp_force"] > CLAMPED_N) & np.isfinite(signal)
     if channel != "stiffness" or not applied.any():
         applied = np.isfinite(signal)
-    unit = UNITS[channel]
-    traces = []
-    for residual, name, style in (
-        (diagnosis.selection.screening.initial[channel], "before", PALE),
-        (diagnosis.selection.model.residual[channel], "after", MODEL),
-    ):
-        traces.append(Trace(name, *_bin(signal[applied], residual[applied]), style))
-    traces.append(Trace("what it does", *_bin(signal[applied], finding.contribution[applied]), MARKS))
-    panels = [Panel(f"mean residual of the {NAMES[channel]}", unit, traces)]
+    first, last = diagnosis.selection.screening.initial[channel], diagnosis.selection.model.residual[channel]
+    parts = (("before", first, PALE), ("after", last, MODEL), ("what it does", finding.contribution, MARKS))
+    traces = [Trace(name, *_bin(signal[applied], shown[applied]), style) for name, shown, style in parts]
+    panels = [Panel(f"mean residual of the {NAMES[channel]}", UNITS[channel], traces)]
     section.figure(xy_figure(panels, _axis(finding.effect.signal)), "Mean residual in bins of equal counts.")
     for text, share in finding.placebos.items():
         section.text(f"Placebo: with {text} the same term reaches {100 * share:.0f} % of this gain.")

@@ -11,14 +11,10 @@ from emb_daemon.offline.score import rmse
 
 
 def plain_left(fitted: Bench, kept: np.ndarray, judged: Bench, asked: np.ndarray) -> np.ndarray:
-    """Errors (N) of a plain fit, at the samples of ``judged``; 0 where none is ``asked``.
+    """Errors (N) of a plain fit at those samples of ``judged`` that are ``asked`` for, mask (m,); 0 at others.
 
-    Args:
-        fitted: logs that are fitted.
-        kept: which of their samples are, mask over those of all logs, shape (n,).
-        judged: logs that are judged, in the same unit as their torque residual; may be the same.
-        asked: which of their samples are, shape (m,).
-    """
+    It is fitted to those samples of ``fitted`` that are ``kept``, mask (n,). Both are in the unit of their torque residual,
+    and may be the same."""
     columns, wanted = _table(fitted)
     scale = np.linalg.norm(columns[kept], axis=0)
     scale[scale == 0.0] = 1.0

@@ -15,7 +15,6 @@ _LISTED = 6
 
 
 def report(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Everything, for scripts."""
     before, after = diagnosis.bench.calibration.noise, diagnosis.calibration.noise
     return {
         "paths": {
@@ -97,7 +96,6 @@ def _gain(gain: float, channel: str | None) -> dict:
 
 
 def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
-    """One entry of ``effects``."""
     effect = finding.effect
     parameters = {
         p.name: {"value": finding.values[p.name], "sigma": finding.sigmas.get(p.name, 0.0), "unit": p.unit}

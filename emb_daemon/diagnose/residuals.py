@@ -253,13 +253,7 @@ def _follows_current(effects: np.void) -> bool:
 
 
 class Bench:
-    """Logs on which a calibration's parameters are tried: runs the estimator and returns residuals, channel by channel.
-
-    Attributes:
-        channels: those that these logs can judge.
-        straight: whether heat answers so nearly in proportion that one derivative serves all iterations of a fit.
-        middle: of the motor angles that occur, rad; harmonics are fitted about it.
-    """
+    """Logs on which a calibration's parameters are tried: runs the estimator and returns residuals, channel by channel."""
 
     def __init__(
         self,
@@ -275,6 +269,7 @@ class Bench:
         ``load_follows``: as the logs say with which these are compared; as they say themselves, if it is not given."""
         self.calibration = calibration
         self.own_data = own_data
+        #: Whether heat answers so nearly in proportion that one derivative serves all iterations of a fit.
         self.straight: bool = True
         # Waiting for another thread costs more than most of these tasks.
         self.map: Callable[..., Iterator[Any]] = ThreadPoolExecutor(workers).map if workers > 1 else map
@@ -298,7 +293,9 @@ class Bench:
         self.current_late_s: float = max(late, key=abs)
         #: Current below which its sensor tells nothing, A: friction that seems to need none there is no cause.
         self.current_dead_A: float = _dead_band_A(logs)
+        #: Those that these logs can judge.
         self.channels: list[str] = [channel for channel in self._channels() if channel in FORCE_CHANNELS or not own_data]
+        #: Of the motor angles that occur, rad; harmonics are fitted about it.
         self.middle: float = float(np.mean(np.concatenate([trial.log.samples["angle"] for trial in self.trials])))
         #: Whether the load follows the current, and not the current the load: then its error at a given current is judged.
         self.load_follows: bool = self._load_follows() if load_follows is None else load_follows
@@ -367,7 +364,6 @@ class Bench:
 
     @property
     def sources(self) -> list[str]:
-        """Names of the logs."""
         return [trial.log.path.name for trial in self.trials]
 
     @property
@@ -421,7 +417,6 @@ class Bench:
         return result
 
     def under(self, calibration: Calibration) -> "Bench":
-        """The same logs under another calibration."""
         result = copy.copy(self)
         result.calibration = calibration
         return result
@@ -530,11 +525,7 @@ class Bench:
         return np.where(sliding, left, 0.0)
 
     def regressors(
-        self,
-        values: Values,
-        probes: Sequence["Probe"],
-        at: Mapping[str, np.ndarray],
-        heat: Sequence[np.ndarray | None],
+        self, values: Values, probes: Sequence["Probe"], at: Mapping[str, np.ndarray], heat: Sequence[np.ndarray | None]
     ) -> list[np.ndarray]:
         """How the probed coordinates' own channels answer: minus the derivative of the residual, which is ``at`` by channel.
 

@@ -59,47 +59,39 @@ NO_RIVALS: dict[str, tuple[str, ...]] = {"torque": ("motor_acceleration", "curre
 
 @dataclass(frozen=True)
 class Candidate:
-    """What became of one effect of the catalogue.
-
-    Attributes:
-        channel: that shows it, or None where these logs have none.
-        amplitudes, shape: the coordinates tested, and the shape in which they were.
-        columns: their regressors.
-        gain: RMS that it takes away on left-out episodes, in the channel's unit; share_explained of the first residual's mean
-            square.
-        placebos: share of the gain that it reaches with what it rests on disturbed, by what is disturbed.
-        reason: why it is not accepted, or what it rests on.
-        values, sigmas: by parameter; before: as calibrated, for an effect that was.
-        contribution: what it takes from the channel's residual, at every sample.
-        over: its signal at every sample, for a term; signals: that and what multiplies.
-        names: the term in whose place it stands, by which its chance was judged.
-        alike: port and signals of the terms that these logs cannot tell from it, as good as it first.
-        undecided_N: RMS by which those do otherwise.
-    """
+    """What became of one effect of the catalogue."""
 
     effect: Effect
-    channel: str | None
+    channel: str | None  #: that shows it, or None where these logs have none
+    #: ``amplitudes`` and ``shape``: the coordinates tested, and the shape in which they were.
     amplitudes: tuple[Coordinate, ...] = ()
     shape: tuple[tuple[Coordinate, float], ...] = ()
-    columns: tuple[np.ndarray, ...] = field(default=(), repr=False)
+    columns: tuple[np.ndarray, ...] = field(default=(), repr=False)  #: their regressors
     evidence: Evidence = field(default=NOT_EXCITED, repr=False)
     p_value: float = 1.0
     q_value: float = 1.0
+    #: RMS that it takes away on left-out episodes, in the channel's unit; ``share_explained`` of the first residual's mean
+    #: square.
     gain: float = 0.0
     share_explained: float = 0.0
+    #: Share of the gain that it reaches with what it rests on disturbed, by what is disturbed.
     placebos: Mapping[str, float] = field(default_factory=dict)
     accepted: bool = False
     in_calibration: bool = False
-    reason: str = ""
+    reason: str = ""  #: why it is not accepted, or what it rests on
+    #: ``values`` and ``sigmas``: by parameter; ``before``: as calibrated, for an effect that was.
     values: Mapping[str, float] = field(default_factory=dict)
     sigmas: Mapping[str, float] = field(default_factory=dict)
     before: Mapping[str, float] = field(default_factory=dict)
     confounded_with: str | None = None
     manoeuvre: str | None = None
-    names: str = ""
+    names: str = ""  #: the term in whose place it stands, by which its chance was judged
+    #: Port and signals of the terms that these logs cannot tell from it, as good as it first.
     alike: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    undecided_N: float = 0.0
+    undecided_N: float = 0.0  #: RMS by which those do otherwise
+    #: What it takes from the channel's residual, at every sample.
     contribution: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
+    #: Its signal at every sample, for a term; ``signals``: that and what multiplies.
     over: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     signals: tuple[str, ...] = ()
 
@@ -151,8 +143,6 @@ class Screening:
             noise = sample_noise(model.residual[channel], SIDE_BY_SIDE.get(channel, 1))
             return max(noise, _THERMOCOUPLE_K if channel == "temperature" else self.floor(model, channel))
         return achieved(self.bench.calibration, channel, force_N, rise_K, samples)
-
-    # -- tests --------------------------------------------------------------------------------------------------------
 
     def test(self, model: Model, effects: Sequence[Effect]) -> list[Candidate]:
         """Each effect in the shape that does best, with its chance corrected for all that were tried."""
@@ -213,8 +203,6 @@ class Screening:
             values=dict(zip(names, evidence.values.tolist(), strict=False)),
             sigmas=dict(zip(names, evidence.sigmas.tolist(), strict=False)),
         )
-
-    # -- objections ---------------------------------------------------------------------------------------------------
 
     def judge(self, model: Model, candidate: Candidate, rivals: Rivals, tested: Sequence[Candidate]) -> Candidate:
         """With the reason why it may not be accepted, empty if it may, and its placebos if they were asked. ``tested``: all
@@ -304,8 +292,6 @@ class Screening:
         none, another cause keeps its own."""
         alone, both = (self._left_out_with(model, candidate.channel, signal, own) for own in ((), candidate.columns))
         return float((alone - both).sum())
-
-    # -- placebos -----------------------------------------------------------------------------------------------------
 
     def with_placebos(self, model: Model, candidate: Candidate) -> Candidate:
         """With the share of its gain that it reaches with what it rests on disturbed, if it gains anything."""

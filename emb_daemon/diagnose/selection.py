@@ -48,26 +48,21 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Selection:
-    """What a search has chosen so far.
-
-    Attributes:
-        candidates: what became of each effect that was off, by name; the accepted ones are those in the model.
-        recalibrated: channels whose base parameters were off, with the RMS that refitting them gains on left-out episodes.
-        refused: channels whose recalibration was taken out again, with what it gained and why.
-        dropped: effects that were accepted and are not to be tried again.
-        at_first: what the residual depended on before any effect was accepted, by channel.
-        instead: what was chosen out of the catalogue alone, where some of it gave way to terms.
-        longer: what was chosen with a term that went because its path, refitted, is described more shortly without it.
-    """
+    """What a search has chosen so far."""
 
     model: Model
     screening: Screening
+    #: What became of each effect that was off, by name; the accepted ones are those in the model.
     candidates: dict[str, Candidate] = field(default_factory=dict)
+    #: Channels whose base parameters were off, with the RMS that refitting them gains on left-out episodes.
     recalibrated: dict[str, float] = field(default_factory=dict)
+    #: Channels whose recalibration was taken out again, with what it gained and why.
     refused: Mapping[str, tuple[float, str]] = field(default_factory=dict)
-    dropped: frozenset[str] = frozenset()
+    dropped: frozenset[str] = frozenset()  #: effects that were accepted and are not to be tried again
+    #: What the residual depended on before any effect was accepted, by channel.
     at_first: Mapping[str, list[Dependence]] = field(default_factory=dict)
-    instead: "Selection | None" = None
+    instead: "Selection | None" = None  #: what was chosen out of the catalogue alone, where some of it gave way to terms
+    #: What was chosen with a term that went because its path, refitted, is described more shortly without it.
     longer: "Selection | None" = None
 
     @property
@@ -409,10 +404,8 @@ def _failing(selection: Selection, name: str) -> tuple[float, str, list[Coordina
             # without it.
             unclear, without = False, model.without(model.of_effect(name)).refined({candidate.channel})
             fall = np.subtract(*(m.left_out(candidate.channel, samples=samples) for m in (without, model)))
-            gain, chance = (
-                model.rms(fall.sum(), candidate.channel),
-                float(ttest_1samp(fall, 0.0, alternative="greater").pvalue),
-            )
+            gain = model.rms(fall.sum(), candidate.channel)
+            chance = float(ttest_1samp(fall, 0.0, alternative="greater").pvalue)
         little = gain < floor
         # A term that is above chance over the whole grammar may rest on few episodes, but its gain must matter and its
         # amplitude be clear of zero. An effect that gains too little to matter stays only if it is clear of zero with its

@@ -47,6 +47,12 @@ def number(value: float, sigma: float) -> str:
     return f"{value:.3g} ± {sigma:.2g}" if sigma > 0.0 else f"{value:.3g}"
 
 
+def _entry(key: str, value: float, sigma: float, unit: str, before: float | None = None) -> str:
+    """A number with its name and unit, and with what it was before."""
+    was = "" if before is None else f"{before:.3g} → "
+    return f"{in_words(key)} {was}{number(value, sigma)} {'' if unit == '1' else unit}".strip()
+
+
 def title(finding: Candidate) -> str:
     if finding.made:
         return f"a term of {_place(finding.effect.hook, finding.signals)}"
@@ -71,20 +77,13 @@ def _told(diagnosis: Diagnosis, finding: Candidate) -> str:
 
 def size(finding: Candidate) -> str:
     """The parameters that say how large an effect is, with units."""
-    found = amplitudes(finding)
-    parts = [f"{in_words(name)} {number(v['value'], v['sigma'])} {_unit(v['unit'])}" for name, v in found.items()]
+    parts = [_entry(name, **found) for name, found in amplitudes(finding).items()]
     for parameter in finding.effect.parameters:
         name = parameter.name
-        if "cosine" in name or "sine" in name or name not in finding.values:
-            continue
-        value = number(finding.values[name], finding.sigmas.get(name, 0.0))
-        before = f"{finding.before[name]:.3g} → " if name in finding.before else ""
-        parts.append(f"{in_words(name)} {before}{value} {_unit(parameter.unit)}")
-    return ", ".join(part.strip() for part in parts)
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else unit
+        if "sine" not in name and name in finding.values:
+            sigma = finding.sigmas.get(name, 0.0)
+            parts.append(_entry(name, finding.values[name], sigma, parameter.unit, finding.before.get(name)))
+    return ", ".join(parts)
 
 
 def verdict(diagnosis: Diagnosis) -> str:
@@ -132,9 +131,8 @@ def _plain(diagnosis: Diagnosis) -> list[str]:
 def _late(diagnosis: Diagnosis) -> list[str]:
     """The reference force is late, which is no error of the brake."""
     late_s = diagnosis.reference_late_s
-    if late_s < _SAID_S:
-        return []
-    return [f"The reference force comes {1e3 * late_s:.1f} ms after angle and current, and is judged at its own time."]
+    told = f"The reference force comes {1e3 * late_s:.1f} ms after angle and current, and is judged at its own time."
+    return [told] if late_s >= _SAID_S else []
 
 
 def _apart(diagnosis: Diagnosis) -> list[str]:
@@ -150,11 +148,9 @@ def _apart(diagnosis: Diagnosis) -> list[str]:
 
 
 def _dead(diagnosis: Diagnosis) -> list[str]:
-    """The current sensor has a dead band."""
     dead_A = diagnosis.bench.current_dead_A
-    if not dead_A:
-        return []
-    return [f"The current is either 0 or above {dead_A:.3g} A, a dead band: the torque path is judged where it is above."]
+    told = f"The current is either 0 or above {dead_A:.3g} A, a dead band: the torque path is judged where it is above."
+    return [told] if dead_A else []
 
 
 def _outside(diagnosis: Diagnosis) -> list[str]:
@@ -189,10 +185,10 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
         parts.append((max(r.gain for r in curve), f"stiffness scale {100.0 * change:+.1f} %{guess}"))
     for key, r in diagnosis.recalibrated.items():
         if UNITS[r.channel] == "N" and not key.startswith("stiffness.curves"):
-            parts.append((r.gain, f"{in_words(key)} {r.before:.3g} → {number(r.value, r.sigma)} {_unit(r.unit)}"))
+            parts.append((r.gain, _entry(key, r.value, r.sigma, r.unit, r.before)))
     if not parts:
         return []
-    told = [f"{text.strip()} (gains {gain:.3g} N)" for gain, text in sorted(parts, key=lambda part: -part[0])[:_TOLD]]
+    told = [f"{text} (gains {gain:.3g} N)" for gain, text in sorted(parts, key=lambda part: -part[0])[:_TOLD]]
     offset = diagnosis.recalibrated.get(OFFSET_FRICTION)
     # The fit went down to zero, which no machine has.
     none = offset is not None and offset.value < _NO_FRICTION * offset.before
@@ -226,7 +222,7 @@ def _no_tolerance(diagnosis: Diagnosis) -> list[str]:
     found = []
     for key, r in diagnosis.recalibrated.items():
         if not r.is_tolerance:
-            change = f"{in_words(key)} {r.before:.3g} → {number(r.value, r.sigma)} {_unit(r.unit)}".strip()
+            change = _entry(key, r.value, r.sigma, r.unit, r.before)
             found.append(f"{change}, where units, wear and temperature make a factor of {r.tolerated:.3g} at most")
     like = "another part, a signal in a wrong scale, or an effect that these logs cannot tell from it looks like that"
     return [f"No tolerance: {'; '.join(found)}: {like}."] if found else []
@@ -270,9 +266,8 @@ def _withdrawn(diagnosis: Diagnosis, channel: str) -> list[str]:
 
 def _stated(diagnosis: Diagnosis) -> list[str]:
     before, now = (c.noise.torque_lasting for c in (diagnosis.bench.calibration, diagnosis.calibration))
-    if now <= before:
-        return []
-    return [f"Some stops leave the torque off by another {100.0 * now:.2g} %, which the calibration states from now on."]
+    told = f"Some stops leave the torque off by another {100.0 * now:.2g} %, which the calibration states from now on."
+    return [told] if now > before else []
 
 
 def table(diagnosis: Diagnosis) -> str:

@@ -28,31 +28,20 @@ _FRICTION_SHARE = 0.08
 
 @dataclass(frozen=True)
 class Dependence:
-    """Dependence of one channel's residual on one signal.
-
-    Attributes:
-        share: of the left-out squared error that smooth functions of the signal take away.
-        rms: the same as RMS in N.
-        certainty: mean relative gain over its standard error; relative, so that one violent stop has one vote.
-        matters: sure, and large enough for a word.
-    """
+    """Dependence of one channel's residual on one signal."""
 
     channel: str
     signal: str
-    share: float
-    rms: float
-    certainty: float
-    matters: bool
+    share: float  #: of the left-out squared error that smooth functions of the signal take away
+    rms: float  #: the same as RMS in N
+    certainty: float  #: mean relative gain over its standard error; relative, so that one violent stop has one vote
+    matters: bool  #: sure, and large enough for a word
 
 
 def dependences(channel: str, gains: dict[str, tuple[np.ndarray, np.ndarray]], samples: int, floor: float) -> list[Dependence]:
-    """One for each signal, strongest first.
-
-    Args:
-        gains: by signal, squared error of each left-out episode without and with a smooth function of the signal.
-        samples: that the squared errors are summed over.
-        floor: RMS (N) from which a dependence matters.
-    """
+    """One for each signal, strongest first. ``gains``: by signal, squared error of each left-out episode without and with a
+    smooth function of the signal; ``samples``: that the squared errors are summed over; ``floor``: RMS (N) from which a
+    dependence matters."""
     result = []
     for signal, (without, with_) in gains.items():
         gain = without - with_
@@ -68,27 +57,19 @@ def dependences(channel: str, gains: dict[str, tuple[np.ndarray, np.ndarray]], s
 
 @dataclass(frozen=True)
 class Left:
-    """What is left of one channel's residual.
-
-    Attributes:
-        rms: of what lasts of the residual after everything, on the judging logs, in the channel's unit.
-        achieved: the same of what the calibration achieved on its own data, by its figures and its noise; NaN where it does
-            not say.
-        share: of the mean square there was before, that is left.
-        dependences: on signals, strongest first.
-        log: the only one on which so much is left, if it is not all.
-        fitted: where a term was made that does not carry over whole, what it leaves of the fitted logs, by the forces of
-            these; else NaN.
-        time_s: on that log, at the middle of the only episode in which so much is left, if it is not all of the log.
-    """
+    """What is left of one channel's residual."""
 
     channel: str
-    rms: float
+    rms: float  #: of what lasts of the residual after everything, on the judging logs, in the channel's unit
+    #: The same of what the calibration achieved on its own data, by its figures and its noise; NaN where it does not say.
     achieved: float
-    share: float
-    dependences: tuple[Dependence, ...]
-    log: str = ""
+    share: float  #: of the mean square there was before, that is left
+    dependences: tuple[Dependence, ...]  #: on signals, strongest first
+    log: str = ""  #: the only one on which so much is left, if it is not all
+    #: On that log, at the middle of the only episode in which so much is left, if it is not all of the log.
     time_s: float | None = None
+    #: Where a term was made that does not carry over whole, what it leaves of the fitted logs, by the forces of these; else
+    #: NaN.
     fitted: float = float("nan")
 
     @property
@@ -153,11 +134,8 @@ def achieved(calibration: Calibration, channel: str, force_N: np.ndarray, rise_K
     """RMS of a channel's residual that the calibration had on its own data: the worst of its figures on logs that fitted
     nothing, or what its noise makes over these forces, if that is more. NaN where it says neither.
 
-    Args:
-        force_N: clamp forces of the judging logs.
-        rise_K: of their pads and disc since the beginning, measured; NaN where there is none.
-        samples: over which the residual is averaged; of the paths' errors that leaves what their correlation times say.
-    """
+    Forces and ``rise_K`` (of pads and disc since the beginning, measured; NaN where there is none) are of the judging logs.
+    The residual is averaged over ``samples``; of the paths' errors that leaves what their correlation times say."""
     figures = calibration.provenance.achieved if calibration.provenance else {}
     noise, motor = calibration.noise, calibration.motor
     # Without a reference the current is held against the stiffness path: its error comes on top.

@@ -37,16 +37,9 @@ _AGAIN = "run the same command again, with --resume if it has that option"
 
 @contextlib.contextmanager
 def cluster(address: str | None = None, workers: int | None = None) -> Iterator[Any]:
-    """A `distributed.Client`.
-
-    Args:
-        address: of a scheduler (``tcp://host:8786``) whose workers see the data set; None: processes of this machine.
-        workers: number of these processes; None: number of cores.
-
-    Raises:
-        Unavailable: no scheduler answers.
-        InputError: the address is not valid.
-    """
+    """A `distributed.Client` of the scheduler at an address (``tcp://host:8786``), whose workers see the data set, or of so
+    many ``workers`` of this machine, one for each core if neither is given. Raises Unavailable: no scheduler answers;
+    InputError: the address is not valid."""
     # One thread each: a worker uses one core, and BLAS must not start more threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Arrow's own allocator would keep the memory that the largest drive took.
@@ -128,17 +121,11 @@ def run(
     progress: Callable[[int, int], None] = lambda done, total: None,
     failed: Callable[[_Item, str], _Result] | None = None,
 ) -> list[_Result]:
-    """``task(item)`` of every item, in their order.
+    """``task(item)`` of every item, in their order. ``progress`` is called with the number of items done and of all items.
 
-    Args:
-        progress: called with the number of items done and of all items.
-        failed: gives, from item and reason, the result for an item whose task raises InputError or kills its worker even when
-            it runs alone. None: such an error ends the work.
-
-    Raises:
-        InputError: of a task, where ``failed`` is None.
-        Unavailable: the scheduler or all workers are gone.
-    """
+    ``failed`` gives, from item and reason, the result for an item whose task raises InputError or kills its worker even when
+    it runs alone; without it such an error ends the work. Raises InputError: of a task; Unavailable: the scheduler or all
+    workers are gone."""
     from distributed import CancelledError
     from distributed.scheduler import KilledWorker
 
@@ -147,7 +134,6 @@ def run(
     done = 0
 
     def submit(rows: Iterable[int]) -> dict[Any, int]:
-        """Rows by the futures of their tasks."""
         return {client.submit(task, items[row], pure=False): row for row in rows}
 
     def settle(row: int, future: Any, final: tuple[type[Exception], ...]) -> None:

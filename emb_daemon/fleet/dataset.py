@@ -60,12 +60,9 @@ class Drive:
 
 @dataclass(frozen=True)
 class About:
-    """Information on the log in a drive's file, in addition to the samples.
-
-    Attributes:
-        refused: frames of the corner and the car that failed the checks of E2E, sequence or range, by verdict.
-        notes: remarks of the reader: truncated, resampled to the daemon's rate.
-    """
+    """Information on the log in a drive's file, in addition to the samples. ``refused``: frames of the corner and the car that
+    failed the checks of E2E, sequence or range, by verdict; ``notes``: remarks of the reader: truncated, resampled to the
+    daemon's rate."""
 
     source: str
     refused: dict[str, int]

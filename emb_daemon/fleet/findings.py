@@ -43,32 +43,23 @@ Fleet = Mapping[tuple[str, str], Sequence[Score]]
 
 
 class Finding(msgspec.Struct, kw_only=True):
-    """Something that differs from the calibration, or from the other units.
+    """Something that differs from the calibration, or from the other units."""
 
-    Attributes:
-        where: a level of a factor (``batch A``), ``all units``, or a unit and corner.
-        units: how many share it.
-        cause, key, shape, amount, sigma, unit: see `scores.Cause`; ``amount`` is the difference from the others, or the change
-            per 30 days or 10 K.
-        size_N: RMS of its force in contact, with the amount's sign; ``sigma_N`` its standard deviation.
-        chance: of a false alarm, corrected for all tests: for groups that any is false, for units the q-value.
-        rivals: causes that explain nearly as much.
-        action: what to do next.
-    """
-
-    where: str
-    units: int
+    where: str  #: a level of a factor (``batch A``), ``all units``, or a unit and corner
+    units: int  #: how many share it
+    #: ``cause``, ``key``, ``shape``, ``amount``, ``sigma`` and ``unit``: see `scores.Cause`; ``amount`` is the difference from
+    #: the others, or the change per 30 days or 10 K.
     cause: str
     key: str
     shape: float | None
     amount: float
     sigma: float
     unit: str
-    size_N: float
+    size_N: float  #: RMS of its force in contact, with the amount's sign; ``sigma_N`` its standard deviation
     sigma_N: float
-    chance: float
-    rivals: tuple[str, ...]
-    action: str
+    chance: float  #: of a false alarm, corrected for all tests: for groups that any is false, for units the q-value
+    rivals: tuple[str, ...]  #: causes that explain nearly as much
+    action: str  #: what to do next
 
 
 class Placed(msgspec.Struct, kw_only=True):
@@ -174,15 +165,8 @@ def find(
     factors: Mapping[str, Mapping[str, str]],
     silent: Mapping[str, str],
 ) -> Findings:
-    """All findings from a fleet's scores.
-
-    Args:
-        causes: in the order of the scores' columns.
-        factors: by unit and name, properties that units share: batch, supplier.
-
-    Raises:
-        InputError: too few units to distinguish one from the others.
-    """
+    """All findings from a fleet's scores. ``causes``: in the order of the scores' columns; ``factors``: by unit and name,
+    properties that units share: batch, supplier. Raises InputError: too few units to distinguish one from the others."""
     slopes = np.median([len(scores) for scores in fleet.values()] or [0]) >= _SLOPE_DRIVES
     least = _SLOPE_DRIVES if slopes else _LEAST_DRIVES
     placed = {key: scores for key, scores in fleet.items() if len(scores) >= least}

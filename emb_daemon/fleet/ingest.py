@@ -37,14 +37,9 @@ class Job:
 
 
 def jobs(root: Path, paths: Iterable[Path], pattern: str = UNIT_OF_PATH, mapping: Path | None = None) -> list[Job]:
-    """Log files that are not in the data set yet, by path, size and time of change.
-
-    Args:
-        pattern: regular expression that finds ``unit``, and ``day`` if it has such a group, in a log's absolute path.
-
-    Raises:
-        InputError: the pattern is not valid, has no group ``unit``, or does not match a path.
-    """
+    """Log files that are not in the data set yet, by path, size and time of change. ``pattern``: regular expression that finds
+    ``unit``, and ``day`` if it has such a group, in a log's absolute path. Raises InputError: the pattern is not valid, has no
+    group ``unit``, or does not match a path."""
     try:
         compiled = re.compile(pattern)
     except re.error as error:

@@ -31,11 +31,8 @@ def learn_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, re
     """Adaptation over one unit's drives in order; each begins with a power-on and the values learned before. Returns every
     training and its outcome.
 
-    ``resume``: keep an existing result of the same drives, made by the same (`made_by`).
-
-    Raises:
-        InputError: a drive's file is missing or damaged.
-    """
+    ``resume``: keep an existing result of the same drives, made by the same (`made_by`). Raises InputError: a drive's file is
+    missing or damaged."""
     corner, path = drives[0].corner, learned_path(root, drives[0].unit, drives[0].corner)
     result = {"made_by": made_by(calibration), "drives": [drive.digest for drive in drives]}
     if resume and path.exists():
@@ -80,14 +77,8 @@ def population(root: Path, calibration: Calibration) -> dict[str, RandomEffects]
 
 def prior(root: Path, calibration: Calibration) -> tuple[Calibration, dict[str, RandomEffects]]:
     """Calibration for the next unit of this kind: the population's means, with the standard deviation between units as sigma
-    of each key and of the clearance, and bounds of adaptation from their spread.
-
-    Returns:
-        (calibration, the population's random effects by key).
-
-    Raises:
-        InputError: too few units have an accepted training.
-    """
+    of each key and of the clearance, and bounds of adaptation from their spread. Returns (calibration, the population's random
+    effects by key). Raises InputError: too few units have an accepted training."""
     least, learned = 2 * LEAST_UNITS, population(root, calibration)
     learned = {key: found for key, found in learned.items() if found.units >= least and not key.startswith("noise.")}
     if not learned:

@@ -33,17 +33,11 @@ _FOLDS = 10
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions that the drives can distinguish.
+    """Directions that the drives can distinguish."""
 
-    Attributes:
-        basis: shape (causes, directions): scores times this are the coordinates of scores.
-        signatures: shape (causes, directions): vector of one unit of each cause.
-        size_N: RMS (N) of one unit of each cause over samples in contact, without the contact angle.
-    """
-
-    basis: np.ndarray
-    signatures: np.ndarray
-    size_N: np.ndarray
+    basis: np.ndarray  #: shape (causes, directions): scores times this are the coordinates of scores
+    signatures: np.ndarray  #: shape (causes, directions): vector of one unit of each cause
+    size_N: np.ndarray  #: RMS (N) of one unit of each cause over samples in contact, without the contact angle
 
     @classmethod
     def of(cls, scores: Sequence[Score]) -> "Directions":
@@ -69,17 +63,11 @@ class Directions:
 
 @dataclass(frozen=True)
 class Unit:
-    """Result of all drives of one unit.
+    """Result of all drives of one unit."""
 
-    Attributes:
-        values: coordinates as linear functions of the covariates, shape (m, q).
-        noise: covariance of each row from drive to drive, shape (m, q, q).
-        freedom: number of drives, beyond those that the values take, from which the noise is known.
-    """
-
-    values: np.ndarray
-    noise: np.ndarray
-    freedom: int
+    values: np.ndarray  #: coordinates as linear functions of the covariates, shape (m, q)
+    noise: np.ndarray  #: covariance of each row from drive to drive, shape (m, q, q)
+    freedom: int  #: number of drives, beyond those that the values take, from which the noise is known
 
 
 def find_slope_directions(
@@ -89,11 +77,7 @@ def find_slope_directions(
 
     For example, a torque constant that changes with the ambient temperature has the same force as a constant fade of the
     torque constant with temperature. If both were free, they would cancel each other with hundreds of newtons each, and
-    explain the misfit of a model.
-
-    Args:
-        covariates: of each unit's drives.
-    """
+    explain the misfit of a model. ``covariates``: of each unit's drives."""
     basis, remaining, square = directions.basis, 0.0, 0.0
     for scores, covariate in zip(units, covariates, strict=True):
         information = np.array([basis.T @ score.products[:-1, :-1] @ basis for score in scores])
@@ -112,8 +96,7 @@ def fit_unit(scores: Sequence[Score], directions: Directions, covariates: np.nda
 
     Of each covariate only the directions in ``free`` are not zero, see `find_slope_directions`. A ridge of `_RIDGE` draws
     directions to zero about which the drives contain little information. The covariance is that of drives, not of samples: the
-    sandwich estimator (White, Econometrica 48, 1980) over each drive's contribution to the equations at the solution.
-    """
+    sandwich estimator (White, Econometrica 48, 1980) over each drive's contribution to the equations at the solution."""
     from scipy.linalg import block_diag
 
     basis, (drives, count) = directions.basis, covariates.shape
@@ -174,19 +157,9 @@ def _squared_distances(deviations: np.ndarray, covariance: np.ndarray) -> np.nda
 class Readings:
     """Amount of each cause in each unit, measured along the direction that the other units' scatter disturbs least.
 
-    Args:
-        units: shape (N, q).
-        centre: centre of each unit's groups, shape (N, q); scatter is about it.
-        signatures: of the causes, shape (K, q); a cause whose signature is zero is never found.
-        noise: covariance of each unit by its own drives, shape (N, q, q).
-        freedom: of each unit's noise, shape (N,).
-
-    Attributes:
-        signatures, freedom: as given.
-        ordinary: units that are not outliers, shape (N,).
-        filters: by unit and cause, weights that measure its vector, shape (N, K, q).
-        inverse: of the scatter's covariance, mean over the parts, shape (q, q).
-    """
+    ``units`` and the ``centre`` of each one's groups, about which scatter is, have shape (N, q), the causes' ``signatures``
+    (K, q); a cause whose signature is zero is never found. ``noise``: covariance of each unit by its own drives, shape (N, q,
+    q), with its ``freedom``, shape (N,)."""
 
     def __init__(self, units: np.ndarray, centre: np.ndarray, signatures: np.ndarray, noise: np.ndarray, freedom: np.ndarray):
         # With few drives even the noise is not known in all directions: half of it is taken as independent.
@@ -197,14 +170,17 @@ class Readings:
         others = [estimate_scatter(centred[fold != part], typical) for part in range(fold.max() + 1)]
         self._inverse = np.array([np.linalg.inv(covariance) for _, covariance in others])
         means = np.array([mean for mean, _ in others])
+        #: Units that are not outliers, shape (N,).
         self.ordinary: np.ndarray = _is_ordinary(
             np.einsum("ua,uab,ub->u", centred - means[fold], self._inverse[fold], centred - means[fold]), centred
         )
         along = np.einsum("fab,kb->fka", self._inverse, signatures)
+        #: By unit and cause, weights that measure its vector, shape (N, K, q).
         self.filters: np.ndarray = (along / np.maximum(np.einsum("fka,ka->fk", along, signatures), 1e-300)[:, :, None])[fold]
         self.signatures: np.ndarray = signatures
         self._noise = noise
         self.freedom: np.ndarray = freedom
+        #: Of the scatter's covariance, mean over the parts, shape (q, q).
         self.inverse: np.ndarray = self._inverse.mean(axis=0)
 
     def amounts(self, units: np.ndarray) -> np.ndarray:
@@ -233,23 +209,19 @@ class Readings:
 
 @dataclass(frozen=True)
 class Difference:
-    """A cause that a group of units shares, or in which one unit differs from its group.
+    """A cause that a group of units shares, or in which one unit differs from its group."""
 
-    Attributes:
-        where, cause: name of the group or row of the unit, and row of the signatures.
-        amount, sigma: of the cause; of a unit ``sigma`` is the scatter between units.
-        chance: of a group, that of no difference, corrected for all tested groups and causes (Holm, Scandinavian J. of
-            Statistics 6, 1979): a batch is recalled because of a single finding, so that none may be false. Of a unit the
-            q-value over all (Benjamini and Hochberg): it is only inspected in a workshop, so a known share may be false.
-        rivals: see `Readings.rivals`.
-    """
-
+    #: ``where`` and ``cause``: name of the group or row of the unit, and row of the signatures.
     where: str | int
     cause: int
+    #: ``amount`` and ``sigma``: of the cause; of a unit ``sigma`` is the scatter between units.
     amount: float
     sigma: float
+    #: Of a group, that of no difference, corrected for all tested groups and causes (Holm, Scandinavian J. of Statistics 6,
+    #: 1979): a batch is recalled because of a single finding, so that none may be false. Of a unit the q-value over all
+    #: (Benjamini and Hochberg): it is only inspected in a workshop, so a known share may be false.
     chance: float
-    rivals: tuple[int, ...]
+    rivals: tuple[int, ...]  #: see `Readings.rivals`
 
 
 #: Largest chance of any false group, largest share of false units among those reported, and share of the best cause's gain
@@ -268,14 +240,11 @@ def find_shared_causes(
     against_others: bool,
     misfits: Collection[int] = (),
 ) -> list[Difference]:
-    """Causes that groups of units share, one after the other, the strongest first, until none is significant.
+    """Causes that groups of units (masks, shape (N,)) share, one after the other, the strongest first, until none is
+    significant. Groups are compared with all other units if ``against_others``, otherwise with zero.
 
-    Args:
-        groups: masks of the units, shape (N,).
-        against_others: compare groups with all other units; otherwise with zero.
-        misfits: causes that are subtracted from the units like others, but are no finding; nor is one that has a misfit among
-            its rivals.
-    """
+    ``misfits``: causes that are subtracted from the units like others, but are no finding; nor is one that has a misfit among
+    its rivals."""
     rows, signatures = readings.ordinary, readings.signatures
     chosen: list[tuple[str, int]] = []
     found: list[Difference | None] = []
@@ -376,13 +345,8 @@ def find_centres(units: np.ndarray, factors: Mapping[str, np.ndarray]) -> np.nda
 
 @dataclass(frozen=True)
 class RandomEffects:
-    """A quantity over units.
-
-    Attributes:
-        mean, sigma: of the population, and the mean's standard deviation.
-        spread: standard deviation between units, without noise.
-        units: number of units.
-    """
+    """A quantity over units: the population's mean, that mean's standard deviation, and the standard deviation between units
+    without noise."""
 
     mean: float
     sigma: float

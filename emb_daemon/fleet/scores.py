@@ -39,21 +39,13 @@ _FORCE_CHANNELS = ("stiffness", "torque")
 
 @dataclass(frozen=True)
 class Cause:
-    """A quantity in which units may differ.
+    """A quantity in which units may differ."""
 
-    Attributes:
-        key: of the calibration.
-        name: the effect's, or the key of a base parameter.
-        shape: value of the effect's shape parameter with which it is tried, or None.
-        unit: unit of the amount; base parameters are in multiples of their size.
-        thermal: whether it acts by a temperature.
-    """
-
-    key: str
-    name: str
-    shape: float | None
-    unit: str
-    thermal: bool
+    key: str  #: of the calibration
+    name: str  #: the effect's, or the key of a base parameter
+    shape: float | None  #: value of the effect's shape parameter with which it is tried, or None
+    unit: str  #: unit of the amount; base parameters are in multiples of their size
+    thermal: bool  #: whether it acts by a temperature
 
     def __str__(self) -> str:
         return self.name if self.shape is None else f"{self.name} ({self.shape:g})"
@@ -61,19 +53,14 @@ class Cause:
 
 @dataclass(frozen=True)
 class Score:
-    """Scores of one drive.
-
-    Attributes:
-        products: second moments of the causes' regressors and, last, of the residual, without the contact angle, shape
-            (causes + 1, causes + 1), in the causes' units and N.
-        loaded: number of samples with the pads in contact.
-        ambient_C: ambient temperature, NaN if unknown.
-    """
+    """Scores of one drive."""
 
     drive: Drive
+    #: Second moments of the causes' regressors and, last, of the residual, without the contact angle, shape (causes + 1,
+    #: causes + 1), in the causes' units and N.
     products: np.ndarray
-    loaded: int
-    ambient_C: float
+    loaded: int  #: number of samples with the pads in contact
+    ambient_C: float  #: ambient temperature, NaN if unknown
 
 
 def is_periodic(effect: Effect) -> bool:
@@ -103,11 +90,8 @@ class _Bench(Bench):
 
 
 class Scorer:
-    """The causes under one calibration, and the computation of scores for them.
-
-    Attributes:
-        causes: in the order of a score's columns.
-    """
+    """The causes under one calibration, and the computation of scores for them. ``causes``: in the order of a score's
+    columns."""
 
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
@@ -173,8 +157,7 @@ class Scorer:
 def score_unit(root: Path, drives: Sequence[Drive], calibration: Calibration, resume: bool = True) -> dict[str, str]:
     """Compute and store the scores of every drive of one unit's corner; returns why some cannot be used, by digest.
 
-    ``resume``: keep existing scores made by the same (`made_by`).
-    """
+    ``resume``: keep existing scores made by the same (`made_by`)."""
     scorer, path = Scorer(calibration), scores_path(root, drives[0].unit, drives[0].corner)
     known, silent = read_scores(path, calibration) if resume and path.exists() else ([], {})
     scores = {score.drive: score for score in known if score.drive in drives}

@@ -23,8 +23,7 @@ def nominal(sheet: Datasheet, name: str, pad_thickness_mm: float, measured_mm: S
     """The datasheet's values as a calibration, with a curve for each thickness that was measured. What no datasheet states is
     a placeholder that a step replaces.
 
-    Only the thermal section may stay as it is, if no log heats the pads.
-    """
+    Only the thermal section may stay as it is, if no log heats the pads."""
     actuator = sheet.actuator
     # Full force within a radian: whatever the gear's travel, such a curve lies within it.
     steep = (actuator.rated_clamp_force_N, *[0.0] * (TERMS - 1))

@@ -54,12 +54,8 @@ def _turning_points(angle, threshold):
 
 def _excitation(log: Log, clearance_rad: float) -> tuple[float, bool, float]:
     """How much a log moves the brake; ``clearance_rad`` is the datasheet's, of which the first half is certainly free of
-    contact.
-
-    Returns:
-        (largest reference force in N, whether there are some before the pads first touch, turning points of the motor angle by
-        more than a twentieth of its travel per second of motion).
-    """
+    contact. Returns (largest reference force in N, whether there are some before the pads first touch, turning points of the
+    motor angle by more than a twentieth of its travel per second of motion)."""
     angle, force = log.samples["angle"], log.force_N
     travel = float(np.ptp(angle))
     reversals = _turning_points(angle, max(travel / 20.0, 1e-6)) if travel > 0.0 else 0
@@ -182,8 +178,7 @@ class Campaign:
     def load_motion(self, name: str, part: str, need: str, *, reversals: tuple[float, float]) -> Log | None:
         """A log in which the motor moves at full frame rate, checked for enough force and for how often it turns.
 
-        ``reversals`` bounds the turning points per second of motion that tell a slow clamp from random motion.
-        """
+        ``reversals`` bounds the turning points per second of motion that tell a slow clamp from random motion."""
         log = self.load(name, part, need)
         if log is None:
             return None
@@ -250,12 +245,9 @@ def _missing(value, folder: Path, key: str = "") -> list[str]:
 
 
 def load_campaign(path: str | Path, read: Callable[[Path], tuple[np.ndarray, str]] = read_with_digest) -> Campaign:
-    """Read a campaign and its datasheet; no log is read yet. ``read`` as in `Campaign`.
-
-    Raises:
-        InputErrors: every fault of either file with line and key; every log that is not there.
-        InputError: a file that the campaign needs is missing, or the corner is none.
-    """
+    """Read a campaign and its datasheet; no log is read yet. ``read`` as in `Campaign`. Raises InputErrors: every fault of
+    either file with line and key; every log that is not there. Raises InputError: a file that the campaign needs is missing,
+    or the corner is none."""
     path = Path(path)
     file = load_yaml(path, CampaignFile)
     corner_index(file.corner)

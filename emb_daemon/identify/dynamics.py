@@ -48,7 +48,6 @@ _LEAST = 1e-4
 #: Residuals of this many samples count as one observation: a second, in which a random angle takes ten targets.
 EPISODE = 250
 
-
 #: (error of the stiffness path, reference force) in N on one log, where there is a reference.
 Errors = tuple[np.ndarray, np.ndarray]
 
@@ -71,22 +70,14 @@ class Pads:
 
 @dataclass(frozen=True)
 class CurveFit:
-    """A characteristic curve past its contact.
-
-    Attributes:
-        coefficients: N/rad^(n+1), shape (TERMS,).
-        covariance: of the coefficients.
-        clearances_rad: of each log, from its first angle to contact.
-        clearance_sigmas_rad: their standard deviations.
-        travel_rad: largest travel past contact.
-    """
+    """A characteristic curve past its contact."""
 
     thickness_mm: float
-    coefficients: np.ndarray
-    covariance: np.ndarray
-    clearances_rad: np.ndarray
-    clearance_sigmas_rad: np.ndarray
-    travel_rad: float
+    coefficients: np.ndarray  #: N/rad^(n+1), shape (TERMS,)
+    covariance: np.ndarray  #: of the coefficients
+    clearances_rad: np.ndarray  #: of each log, from its first angle to contact
+    clearance_sigmas_rad: np.ndarray  #: their standard deviations
+    travel_rad: float  #: largest travel past contact
 
     def curve(self) -> Curve:
         return Curve(pad_thickness_mm=self.thickness_mm, coefficients=tuple(float(c) for c in self.coefficients))
@@ -108,23 +99,14 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class DynamicsFit:
-    """Joint fit over pads of several thicknesses.
+    """Joint fit over pads of several thicknesses."""
 
-    Attributes:
-        calibration: with what was found.
-        delay_s: by which the reference is late.
-        sigmas: of the shared dynamics, by key and for `DELAY`; none where they were held.
-        curves: of the pads that were fitted.
-        residuals: simulated minus reference force, by log path.
-        rms: over all samples fitted, N.
-    """
-
-    calibration: Calibration
-    delay_s: float
-    sigmas: dict[str, float]
-    curves: list[CurveFit]
-    rms: float
-    residuals: dict[str, np.ndarray] = field(repr=False)
+    calibration: Calibration  #: with what was found
+    delay_s: float  #: by which the reference is late
+    sigmas: dict[str, float]  #: of the shared dynamics, by key and for `DELAY`; none where they were held
+    curves: list[CurveFit]  #: of the pads that were fitted
+    rms: float  #: over all samples fitted, N
+    residuals: dict[str, np.ndarray] = field(repr=False)  #: simulated minus reference force, by log path
 
     def value(self, key: str) -> float:
         """One of `sigmas`' keys."""
@@ -191,8 +173,7 @@ def errors_unseen(groups: list[Pads], fit: DynamicsFit, delay_s: float = 0.0, sl
 def errors_left_out(groups: list[Pads], every: DynamicsFit, fit: Callable[[list[Pads]], DynamicsFit]) -> list[Errors]:
     """Errors on every log, of a ``fit`` to all others where its pads have another one, and else of that to ``every`` log.
 
-    The contact of a log is its own, and found in it; how unsure it is has a standard deviation of its own.
-    """
+    The contact of a log is its own, and found in it; how unsure it is has a standard deviation of its own."""
     found = []
     for g, (pads, curve) in enumerate(zip(groups, every.curves, strict=True)):
         for number, (log, clearance) in enumerate(zip(pads.logs, curve.clearances_rad, strict=True)):
@@ -272,11 +253,8 @@ def _past_contact(log: Log, calibration: Calibration) -> np.ndarray:
 
 
 def regress_free(log: Log, x: np.ndarray) -> tuple[np.ndarray, float]:
-    """Thesis 3-5: F(i) = a3 x^3 + a2 x^2 + a1 x + a0 F(i-1) by least squares, ``x`` rad past contact at each sample.
-
-    Returns:
-        (coefficients of the static curve, time constant in s).
-    """
+    """Thesis 3-5: F(i) = a3 x^3 + a2 x^2 + a1 x + a0 F(i-1) by least squares, ``x`` rad past contact at each sample. Returns
+    (coefficients of the static curve, time constant in s)."""
     force = log.force_N
     rows = np.flatnonzero(np.isfinite(force[1:]) & np.isfinite(force[:-1]) & (x[1:] > 0.0)) + 1
     span = max(float(x.max()), 1e-9) ** np.arange(1, TERMS + 1)
@@ -430,16 +408,12 @@ def fit_dynamics(
     search: bool = False,
     shared: tuple[str, ...] | None = None,
 ) -> DynamicsFit:
-    """One set of dynamics, a curve for each pair of pads, a contact angle for each log.
+    """One set of dynamics, a curve for each pair of pads, a contact angle for each log. ``start``: dynamics, with the effects
+    that take part, and curves to start from, as ``delay_s`` of the reference.
 
-    Args:
-        start: dynamics, with the effects that take part, and curves to start from.
-        delay_s: of the reference, to start from.
-        fraction: share that is fitted of each log that is not slow, from its beginning.
-        search: try several starting points for angles that shape an effect.
-        shared: which of the dynamics are fitted beside curves and contact angles; all of them and the reference's delay if
-            left out.
-    """
+    ``fraction``: share that is fitted of each log that is not slow, from its beginning; ``search``: try several starting
+    points for angles that shape an effect; ``shared``: which of the dynamics are fitted beside curves and contact angles; all
+    of them and the reference's delay if left out."""
     model = _Model(groups, start, delay_s, fraction, (*dynamics(start), DELAY) if shared is None else shared)
     blocks, first = model.blocks(), model.free
     angles = [key for key in model.shared if key.startswith("effects.") and key.endswith("_rad")]

@@ -47,14 +47,8 @@ class Identification:
 
 
 def identify(campaign: Campaign, progress: Progress = lambda share, text: None) -> Identification:
-    """Run every step that the campaign has logs for.
-
-    Args:
-        progress: called with the share done, 0 to 1, and what comes next.
-
-    Raises:
-        InputError: no log from which a characteristic curve or the torque path could be identified.
-    """
+    """Run every step that the campaign has logs for. ``progress``: called with the share done, 0 to 1, and what comes next.
+    Raises InputError: no log from which a characteristic curve or the torque path could be identified."""
     begin = time.monotonic()
     progress(0.0, "reading logs")
     pads = thickness.load_pads(campaign)
@@ -105,8 +99,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
 def _stiffness_in_time(campaign: Campaign, pads: list[Pads], start: Calibration) -> stiffness.StiffnessStep:
     """The stiffness step, after the reference force of all logs has been moved to its own time if it clearly comes late.
 
-    Otherwise every other step would attribute the delay to the brake: to inertia, friction and the sigma of the force.
-    """
+    Otherwise every other step would attribute the delay to the brake: to inertia, friction and the sigma of the force."""
     found = stiffness.identify(pads, start)
     # The delay that the time stamps of the logs state is not a part of the fitted one.
     stamped_s = 1e-9 * float(np.median([log.stamped_later_ns for own in pads for log in own.logs]))

@@ -26,23 +26,15 @@ _NEED_SINE = "motor angle a sinusoid in contact, at full frame rate"
 
 @dataclass(frozen=True)
 class Validation:
-    """One log, as a rule one that was not fitted.
-
-    Attributes:
-        kind: random, predicted, gear, frequency or integrated: what was left out or predicted for it; or fitted.
-        calibration: that was run.
-        estimates: ESTIMATE rows.
-        figures: `offline.score.force_figures`.
-        innovation_ratio: mean squared normalised innovation; one if the filter's noise levels fit.
-    """
+    """One log, as a rule one that was not fitted."""
 
     name: str
-    kind: str
+    kind: str  #: random, predicted, gear, frequency or integrated: what was left out or predicted for it; or fitted
     log: Log = field(repr=False)
-    calibration: Calibration = field(repr=False)
-    estimates: np.ndarray = field(repr=False)
-    figures: dict[str, Any]
-    innovation_ratio: float
+    calibration: Calibration = field(repr=False)  #: that was run
+    estimates: np.ndarray = field(repr=False)  #: ESTIMATE rows
+    figures: dict[str, Any]  #: `offline.score.force_figures`
+    innovation_ratio: float  #: mean squared normalised innovation; one if the filter's noise levels fit
 
     def rmse_N(self, path: str = "fused") -> float:
         return self.figures[path]["rmse"]

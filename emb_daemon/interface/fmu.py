@@ -85,7 +85,6 @@ def _variables(calibration: Calibration) -> list[_Variable]:
 
 
 def _table(variables: list[_Variable], token: str) -> str:
-    """The content of variables.h."""
     starts = ", ".join(
         f".{signal.field} = {'NAN' if isnan(signal.start) else _text(signal.start)}" for signal in INPUTS if signal.start
     )
@@ -98,7 +97,6 @@ def _table(variables: list[_Variable], token: str) -> str:
 
 
 def _description(variables: list[_Variable], token: str, about: str) -> bytes:
-    """The content of modelDescription.xml."""
     root = ElementTree.Element(
         "fmiModelDescription",
         {
@@ -158,15 +156,8 @@ def _compile(folder: Path, kernels: Path) -> bytes:
 
 
 def make_fmu(calibration: Calibration, kernels: Path) -> bytes:
-    """The FMU's content, for machines like this one.
-
-    Args:
-        kernels: the library that ``emb-daemon compile`` has made.
-
-    Raises:
-        InputError: the library must not be used here.
-        Unavailable: there is no C compiler.
-    """
+    """The FMU's content, for machines like this one. ``kernels``: the library that ``emb-daemon compile`` has made. Raises
+    InputError: the library must not be used here. Raises Unavailable: there is no C compiler."""
     try:
         manifest: Manifest = check(kernels)
     except (Refused, OSError) as refusal:

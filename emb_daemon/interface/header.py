@@ -80,7 +80,6 @@ def _initialise(record: np.void, offset: int, keys: dict[int, Place], indent: st
 
 
 def header(calibration: Calibration) -> str:
-    """The header's text."""
     codes = [f"#define EMB_MODE_{word.upper()} {code}" for code, word in enumerate(MODES)]
     codes += [f"#define EMB_SOURCE_{word.upper()} {code}" for code, word in SOURCES.items()]
     codes += [f"#define EMB_{word.upper().replace(' ', '_')} {1 << bit:#x}" for bit, word in enumerate(REASONS)]

@@ -29,8 +29,7 @@ def places(calibration: Calibration) -> list[Place]:
     """Every number of the file that the estimator uses unchanged, in the record's order.
 
     They are found by changing one number after the other, so that only `to_parameters` defines where they go. Of the
-    characteristic curves, which are interpolated, the mounted pads' coefficients are given as ``stiffness.curve[0]`` on.
-    """
+    characteristic curves, which are interpolated, the mounted pads' coefficients are given as ``stiffness.curve[0]`` on."""
     before, found = _words(calibration), []
     for key in keys(calibration):
         if key.startswith(("stiffness.curves", "terms", "adaptation")):

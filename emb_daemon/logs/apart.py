@@ -37,12 +37,8 @@ _one_at_a_time = threading.Lock()
 def mdf_columns(path: Path, content: bytes, most_bytes: int) -> dict[str, np.ndarray]:
     """Columns of all CAN frames of an MDF4 log in order of time, read with ``most_bytes`` of memory: ``time_ns``, ``can_id``,
     ``length``, whether ``extended``, ``remote``, ``error`` or ``fd``, ``channel``, shape (n,), and ``octets``, shape (n, w).
-    Empty if there is none.
-
-    Raises:
-        InputError: not readable, or not with that much time and memory.
-        ImportError: asammdf is not installed.
-    """
+    Empty if there is none. Raises InputError: not readable, or not with that much time and memory. Raises ImportError: asammdf
+    is not installed."""
     seconds = round(_START_S + _PER_MEGABYTE_S * 1e-6 * len(content))
     with _one_at_a_time:
         reader = _reader(os.pathsep.join(filter(None, sys.path)))

@@ -24,11 +24,7 @@ def array_ending(content: bytes, ending: str) -> str:
 def read_arrays(path: Path, content: bytes, ending: str) -> dict[str, np.ndarray | list[object]]:
     """Columns, n values each, by name: a variable with more than one value, `S.x` of the field of a structure or the dataset
     of a group, `S(2).x` of one of several structures, `c{2}` of cells, `X column 2` of a matrix, whose rows are its longer
-    side. Of a bare array `column 2` is one.
-
-    Raises:
-        InputError: unreadable.
-    """
+    side. Of a bare array `column 2` is one. Raises InputError: unreadable."""
     columns: dict[str, np.ndarray | list[object]] = {}
     try:
         for name, variable in _READERS[ending](path, content):
@@ -94,7 +90,6 @@ def _of_hdf5(path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _of_tdms(_path: Path, content: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """LabVIEW's channels, `group.channel`."""
     from nptdms import TdmsFile
 
     for group in TdmsFile.read(io.BytesIO(content)).groups():

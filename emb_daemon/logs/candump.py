@@ -11,15 +11,9 @@ _RETURN, _NEWLINE = b"\r\n"
 _NO_HEX = 255
 
 
-def _hex_values() -> np.ndarray:
-    values = np.full(256, _NO_HEX, np.uint8)
-    for digit, characters in enumerate(zip("0123456789abcdef", "0123456789ABCDEF", strict=True)):
-        for character in characters:
-            values[ord(character)] = digit
-    return values
-
-
-_HEX = _hex_values()
+#: Value of each byte that is a hexadecimal digit.
+_HEX = np.full(256, _NO_HEX, np.uint8)
+_HEX[[*b"0123456789abcdef"]] = _HEX[[*b"0123456789ABCDEF"]] = np.arange(16)
 _NOWHERE = np.zeros(0, np.uint8)
 
 

@@ -42,6 +42,11 @@ _NO_INERTIA, _MUCH = 0.5, 0.5
 _NOT_MEASURED, _EXACT, _STEP, _STEPS, _CLIMBS = 0.9, 1e-6, 0.05, 3, 20
 
 
+def left_of(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """What least squares over ``columns``, (n, k), leave of values, (n,) or (n, m)."""
+    return values - columns @ np.linalg.lstsq(columns, values)[0]
+
+
 def _in_motion(samples: Records, beside: np.ndarray) -> np.ndarray:
     """Speed, current, acceleration and another signal, (n,), of SAMPLE rows in which the motor moves and all is known; none if
     they are few, or so rare that it is accelerated and braked again between them."""
@@ -63,8 +68,7 @@ def other_motor(samples: Records, torque_constant_Nm_per_A: float, inertia_kg_m2
         return []
     way = (angle - angle[0]) / np.ptp(angle)
     known = np.column_stack([np.ones(len(way)), np.sign(speed), speed, way, way**2, way**3])
-    columns = np.column_stack([current, acceleration])
-    left = columns - known @ np.linalg.lstsq(known, columns)[0]
+    left = left_of(np.column_stack([current, acceleration]), known)
     if not np.all(np.ptp(left, axis=0) > 0.0):
         return []
     correlation = float(np.corrcoef(left.T)[0, 1])
@@ -90,11 +94,8 @@ def other_current(samples: Records, force_N: np.ndarray, motor: Motor) -> list[s
     """A line if the current of SAMPLE rows is the same share of what the load and of what the acceleration need, and not one.
 
     Other pads or friction change what a load needs, another inertia what acceleration needs; the scale of the current, as an
-    effective value's, changes both, and a torque constant within its tolerances neither by as much.
-
-    Args:
-        force_N: clamp force, (n,); NaN where it is not known.
-    """
+    effective value's, changes both, and a torque constant within its tolerances neither by as much. ``force_N``: clamp force,
+    (n,); NaN where it is not known."""
     speed, current, acceleration, force = _in_motion(samples, force_N)
     if not len(force):
         return []
@@ -104,8 +105,7 @@ def other_current(samples: Records, force_N: np.ndarray, motor: Motor) -> list[s
     shares = []
     for name, torque in torques.items():
         others = np.column_stack([rest, *(column for other, column in torques.items() if other != name)])
-        columns = np.column_stack([torque, explained])
-        left = columns - others @ np.linalg.lstsq(others, columns)[0]
+        left = left_of(np.column_stack([torque, explained]), others)
         if not np.all(np.ptp(left, axis=0) > 0.0) or np.corrcoef(left.T)[0, 1] < _TOLD_INERTIA:
             return []
         shares.append(float(left[:, 0] @ left[:, 1] / (left[:, 0] @ left[:, 0])))
@@ -193,7 +193,7 @@ def find_driving_friction(speed: Series, current: Series, force: Series | float)
         return []
     known = np.stack([np.ones(len(times)), load, np.gradient(at, 1e-9 * times)], axis=1)[moving]
     columns = np.column_stack([current.values[moving], direction])
-    left = columns - known @ np.linalg.lstsq(known, columns)[0]
+    left = left_of(columns, known)
     correlation = float(np.corrcoef(left.T)[0, 1]) if np.all(np.ptp(left, axis=0) > 0.0) else 0.0
     if correlation > -AGAINST:
         return []
@@ -218,12 +218,8 @@ def find_other_current(speed: Series, current: Series, force: Series | float) ->
     if np.sum(known) < LEAST:
         return []
     values = current.values[: len(times)][known]
-
-    def left_A(explaining: np.ndarray) -> float:
-        columns = np.hstack([rest, explaining])[known]
-        return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
-
-    by_load_A, by_power_A = left_A(torques), left_A(torques * at[:, None])
+    explaining = (torques, torques * at[:, None])
+    by_load_A, by_power_A = (float(np.std(left_of(values, np.hstack([rest, more])[known]))) for more in explaining)
     by_size_A = _left_by_size(values, np.hstack([rest[:, :3], torques])[known])
     if by_load_A > _OTHERWISE * by_size_A and by_size_A < by_power_A:
         return [

@@ -31,11 +31,7 @@ def load_foreign(path: Path) -> "Database":
     """A rig's cantools database; its signals may overlap and reach beyond their message.
 
     Statements that no DBC may have are left out, with a line on stderr, as long as they are few; ids that need 29 bits are
-    taken to be long, whether their file says so or not.
-
-    Raises:
-        InputError: the file cannot be read or is no DBC.
-    """
+    taken to be long, whether their file says so or not. Raises InputError: the file cannot be read or is no DBC."""
     if path.suffix.lower() in NO_DBC:
         return load_database(path, strict=False)
     import cantools

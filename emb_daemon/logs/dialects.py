@@ -32,10 +32,8 @@ _PEAK, _PEAK_ERROR = b";$FILEVERSION", re.compile(rb"[ \t]*\d+\)[^\n]*\bERROR\b[
 #: A stray semicolon after the time at which a trace file of PEAK began; version 1.2, which is 1.3 without a reserved column
 #: between id and length.
 _PEAK_START = re.compile(rb"(?m)^(;\$STARTTIME=[\d.]+);")
-_PEAK_1_2, _PEAK_1_2_ID = (
-    re.compile(rb"^;\$FILEVERSION=1\.2\b"),
-    re.compile(rb"(?m)^(\s*\d+\)\s+[\d.]+\s+\d+\s+[RT]x\s+[0-9A-Fa-f]+)"),
-)
+_PEAK_1_2 = re.compile(rb"^;\$FILEVERSION=1\.2\b")
+_PEAK_1_2_ID = re.compile(rb"(?m)^(\s*\d+\)\s+[\d.]+\s+\d+\s+[RT]x\s+[0-9A-Fa-f]+)")
 #: A row of a table that PEAK-Converter makes of one: ``number,ms,bus,Rx|Tx,type,id,reserved,length,bytes``, parted by what its
 #: user chose; types of messages, and of those of CAN FD; how a row of any other type begins, or a comment.
 _PEAK_ROW = re.compile(
@@ -46,9 +44,8 @@ _PEAK_MESSAGES, _PEAK_FD = (b"DT", b"RR"), (b"FD", b"FB", b"FE", b"BI")
 _PEAK_OTHER = re.compile(rb"\s*(\d+\)?[,;\t|]|;|$)")
 #: How a line begins with its time; a text of Vector whose times count from one event to the next; least share of them that
 #: go back where the times that candump shows do so.
-_STAMP, _ASC_RELATIVE, _GOES_BACK = (
-    re.compile(rb"(?m)^([ \t]*\(?)(\d+\.\d+)(?=[\s)])"), re.compile(rb"(?mi)^base\s+\w+\s+timestamps\s+relative\b"), 0.1,
-)  # fmt: skip
+_STAMP = re.compile(rb"(?m)^([ \t]*\(?)(\d+\.\d+)(?=[\s)])")
+_ASC_RELATIVE, _GOES_BACK = re.compile(rb"(?mi)^base\s+\w+\s+timestamps\s+relative\b"), 0.1
 #: Lines at the beginning of a file among which the first frame is looked for.
 _FIRST_LINES = 100
 #: Number of bytes that hold a header.
@@ -59,7 +56,8 @@ def as_candump(content: bytes) -> bytes | None:
     """A text in another format converted to candump's log format line by line; None if the format is unknown. A line that
     cannot be read stays as it is."""
     first = content[:1000].lstrip().split(b"\n", 1)[0]
-    if first.startswith(_GVRET) and all(name in (names := _names(first)) for name in _GVRET_COLUMNS):
+    names = [cell.strip() for cell in first.split(b",")]
+    if first.startswith(_GVRET) and {*_GVRET_COLUMNS} <= {*names}:
         places = [names.index(name) for name in _GVRET_COLUMNS]
         # The header becomes an empty line, so that the line numbers stay the same.
         return b"\n".join([b"", *(_of_gvret(line, places) for line in content.split(b"\n")[1:])])
@@ -126,10 +124,6 @@ def _of_canhacker(lines: list[bytes]) -> Iterator[bytes]:
         yield b"(%.6f) can0 %s#%s" % (passed, found[3].upper(), payload)
 
 
-def _names(header: bytes) -> list[bytes]:
-    return [cell.strip() for cell in header.split(b",")]
-
-
 def _of_peak_table(lines: list[bytes]) -> Iterator[bytes]:
     """Text before the first frame, and rows of events and errors, become empty lines."""
     begun = False
@@ -142,18 +136,18 @@ def _of_peak_table(lines: list[bytes]) -> Iterator[bytes]:
             yield line if begun and not _PEAK_OTHER.match(line) else b""
 
 
+def _line(stamp: bytes, bus: bytes, can_id: int, extended: bool, fd: bool, octets: bytes) -> bytes:
+    """A line of candump's log; ``octets`` in hexadecimal digits, or R of a remote frame."""
+    return b"(%s) %s %s%s%s" % (stamp, bus, (b"%08X" if extended else b"%03X") % can_id, b"##0" if fd else b"#", octets)
+
+
 def _of_peak_row(found: re.Match[bytes]) -> bytes:
     kind, can_id = found["kind"], found["id"]
-    octets = [cell.strip() for cell in found["data"].split(found["mark"])]
+    cells = [cell.strip() for cell in found["data"].split(found["mark"])]
+    octets = b"R" if kind == b"RR" else b"".join(cell for cell in cells if cell not in (b"", b"-", b"--"))
+    stamp = b"%.6f" % (1e-3 * float(found["ms"].replace(b",", b".")))
     # Ids of eleven bits have four digits.
-    width = b"%08X" if len(can_id) > 4 else b"%03X"
-    return b"(%.6f) %s %s%s%s" % (
-        1e-3 * float(found["ms"].replace(b",", b".")),
-        found["bus"],
-        width % int(can_id, 16),
-        b"##0" if kind in _PEAK_FD else b"#",
-        b"R" if kind == b"RR" else b"".join(octet for octet in octets if octet not in (b"", b"-", b"--")),
-    )
+    return _line(stamp, found["bus"], int(can_id, 16), len(can_id) > 4, kind in _PEAK_FD, octets)
 
 
 def _of_terminal(line: bytes) -> bytes:
@@ -161,19 +155,13 @@ def _of_terminal(line: bytes) -> bytes:
     if not found:
         return line
     stamp, interface, can_id, length, data, more = found.groups()
+    octets = b"R" if (more or b"").startswith(b"r") else b"".join(data.split())
     # Lengths of CAN FD have two digits.
-    mark = b"##0" if len(length) > 1 else b"#"
-    return b"(%s) %s %s%s%s" % (
-        stamp,
-        interface,
-        can_id,
-        mark,
-        b"R" if (more or b"").startswith(b"r") else b"".join(data.split()),
-    )
+    return _line(stamp, interface, int(can_id, 16), len(can_id) > 3, len(length) > 1, octets)
 
 
 def _of_gvret(line: bytes, places: list[int]) -> bytes:
-    """Args: places: the columns of time, id, whether it is extended, bus and length; the bytes follow the length."""
+    """``places``: the columns of time, id, whether it is extended, bus and length; the bytes follow the length."""
     cells = [cell.strip() for cell in line.split(b",")]
     try:
         stamp, can_id, extended, bus, length = (cells[place] for place in places)
@@ -181,8 +169,8 @@ def _of_gvret(line: bytes, places: list[int]) -> bytes:
         data = b"".join(b"%02X" % int(cell, 16) for cell in cells[places[-1] + 1 :][:length])
     except (ValueError, IndexError):
         return line
-    width = b"%08X" if extended.lower() == b"true" else b"%03X"
-    return b"(%d.%06d) %s %s%s%s" % (*divmod(micros, 1_000_000), bus, width % can_id, b"##0" if length > 8 else b"#", data)
+    stamp = b"%d.%06d" % divmod(micros, 1_000_000)
+    return _line(stamp, bus, can_id, extended.lower() == b"true", length > 8, data)
 
 
 def _of_busmaster(lines: list[bytes]) -> Iterator[bytes]:
@@ -201,11 +189,5 @@ def _of_busmaster(lines: list[bytes]) -> Iterator[bytes]:
         last = second
         extended, remote = kind[:1] in b"xX", len(kind) > 1
         octets = b"R" if remote else b"".join(b"%02X" % int(octet, base) for octet in data.split()[: int(length)])
-        yield b"(%d.%s) %s %s%s%s" % (
-            second + 2 * _HALF_A_DAY_S * day,
-            fraction,
-            channel,
-            (b"%08X" if extended else b"%03X") % int(can_id, base),
-            b"##0" if int(length) > 8 else b"#",
-            octets,
-        )
+        stamp = b"%d.%s" % (second + 2 * _HALF_A_DAY_S * day, fraction)
+        yield _line(stamp, channel, int(can_id, base), extended, int(length) > 8, octets)

@@ -86,10 +86,7 @@ def _rows(mapping: "Mapping", path: Path, recorded: Recorded, message, channel: 
 def alone(message: "Message", name: str) -> Callable[[bytes], float]:
     """Function that reads one signal of a message (cantools) from a payload, even if others overlap with it in the DBC; NaN if
     the payload is too short or belongs to other multiplexed signals, or if the DBC calls the value one that is not available.
-
-    Raises:
-        cantools.database.Error: the message has no room for it.
-    """
+    Raises cantools.database.Error: the message has no room for it."""
     from cantools.database import DecodeError
     from cantools.database.can import Message
 

@@ -13,13 +13,7 @@ except ImportError:
 
 def inflate(packed: bytes | memoryview, window_bits: int, most_bytes: int) -> tuple[bytes, bool]:
     """Content of a stream, up to where it was cut off or to ``most_bytes``, and whether it is one complete stream.
-
-    Args:
-        window_bits: as of zlib; ``MAX_WBITS``, for gzip ``MAX_WBITS | 16``.
-
-    Raises:
-        InputError: damaged.
-    """
+    ``window_bits``: as of zlib; ``MAX_WBITS``, for gzip ``MAX_WBITS | 16``. Raises InputError: damaged."""
     unpacker = library.decompressobj(window_bits)
     try:
         content = unpacker.decompress(packed, most_bytes)

@@ -193,12 +193,9 @@ def _message(name: str, mapping: Mapping) -> _Message:
 
 
 class MappedBus(PythonCanBus):
-    """A python-can bus of another rig, with the calls of `runtime.bus.PythonCanBus`; what is sent goes out as it is.
-
-    Args:
-        bus: python-can's, without filters; for CAN FD opened with it (`open_buses`).
-        mapping: by the rig's DBC; references are not converted.
-    """
+    """A python-can bus of another rig, with the calls of `runtime.bus.PythonCanBus`; what is sent goes out as it is. ``bus``
+    has no filters, and is opened for CAN FD if the mapping, by the rig's DBC, has any (`open_buses`); references are not
+    converted."""
 
     def __init__(self, bus: PythonCan, mapping: Mapping):
         super().__init__(bus, [])
@@ -231,11 +228,12 @@ class MappedBus(PythonCanBus):
 
     def _sample(self, corner: str, resolver: _Message, time_ns: int) -> list[tuple | None]:
         """A sample of a corner, and the slow messages that are due."""
-        rows = [
-            slow.frame(fill_missing(name, slow.last()), time_ns)
-            for name, slow in self._messages.items()
-            if not name.endswith(("_Resolver", "_Current", "_ForceSensor")) and self._is_due(slow, time_ns)
-        ]
+        rows = []
+        for name, slow in self._messages.items():
+            is_due = time_ns - slow.sent_ns >= _DUE * slow.cycle_ns and slow.fresh(time_ns)
+            if is_due and not name.endswith(("_Resolver", "_Current", "_ForceSensor")):
+                slow.counter += 1
+                rows.append(slow.frame(fill_missing(name, slow.last()), time_ns))
         cycles = max(1, round((time_ns - resolver.sent_ns) / CYCLE_NS)) if resolver.sent_ns else 1
         motion = _motion(resolver, time_ns)
         resolver.counter += cycles
@@ -247,12 +245,6 @@ class MappedBus(PythonCanBus):
                 rows.append(fast.frame(means if kind == "Current" else fast.last(), time_ns))
         rows.append(resolver.frame(motion, time_ns))
         return rows
-
-    def _is_due(self, slow: _Message, time_ns: int) -> bool:
-        if time_ns - slow.sent_ns < _DUE * slow.cycle_ns or not slow.fresh(time_ns):
-            return False
-        slow.counter += 1
-        return True
 
 
 def _motion(resolver: _Message, time_ns: int) -> dict[str, float]:
@@ -295,12 +287,8 @@ class ReferenceBus(PythonCanBus):
 
 def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
     """python-can's bus by its options (`cli.options.bus_options`), or as many as the mapping names channels; for CAN FD if the
-    rig's messages are.
-
-    Raises:
-        InputError: no interface is named, or an unknown one, or the mapping has no DBC.
-        Unavailable: it cannot be opened now.
-    """
+    rig's messages are. Raises InputError: no interface is named, or an unknown one, or the mapping has no DBC. Raises
+    Unavailable: it cannot be opened now."""
     mapping.require_frames()
     if mapping.has_fd:
         options = {"fd": True} | options
@@ -313,12 +301,8 @@ def open_buses(options: dict[str, Any], mapping: Mapping) -> PythonCan:
 
 
 def open_mapped(options: dict[str, Any], mapping: Mapping, layout: np.ndarray) -> MappedBus:
-    """A bus read through a mapping, for a daemon of a LAYOUT.
-
-    Raises:
-        InputErrors: messages of the rig have ids with which the daemon sends.
-        InputError, Unavailable: as `open_buses`.
-    """
+    """A bus read through a mapping, for a daemon of a LAYOUT. Raises InputErrors: messages of the rig have ids with which the
+    daemon sends. Raises InputError, Unavailable: as `open_buses`."""
     if faults := mapping.taken(layout):
         raise InputErrors(faults)
     return MappedBus(open_buses(options, mapping), mapping)

@@ -52,32 +52,26 @@ _USUAL_S, _OF_TIME = 5e-4, ("s", "ms", "us", "ns", "d")
 
 
 class Mapping:
-    """A mapping file, checked against both descriptions.
-
-    Attributes:
-        databases: the rig's (cantools) by bus, None the name of the only one; empty of tables and measurements.
-        channels: by bus, as the log names it; None is any.
-        messages: sources by message and signal of ours, a number where it is a constant; a signal that another stands in for
-            is not among them.
-        notes: a line for each signal that the rig does not measure and that others stand in for.
-
-    Raises:
-        InputErrors: every fault of the file: unknown signals of either DBC, units that do not fit, signals left out.
-    """
+    """A mapping file, checked against both descriptions. Raises InputErrors: every fault of the file: unknown signals of
+    either DBC, units that do not fit, signals left out."""
 
     def __init__(self, path: str | Path):
         self.path: Path = Path(path)
         self._file = load_yaml(self.path, MappingFile)
         buses = {None: Bus(dbc=self._file.dbc)} if self._file.dbc else self._file.buses
+        #: The rig's (cantools) by bus, None the name of the only one; empty of tables and measurements.
         self.databases: dict[str | None, Database] = {
             name: load_foreign(self.path.parent / bus.dbc) for name, bus in buses.items()
         }
+        #: By bus, as the log names it; None is any.
         self.channels: dict[str | None, str | None] = {
             name: None if bus.channel is None else str(bus.channel) for name, bus in buses.items()
         }
         self._ours = our_messages()
         self._faults: list[str] = []
-        self.notes: list[str] = []
+        self.notes: list[str] = []  #: a line for each signal that the rig does not measure and that others stand in for
+        #: Sources by message and signal of ours, a number where it is a constant; a signal that another stands in for is not
+        #: among them.
         self.messages: dict[str, dict[str, Source | float]] = {}
         for name, mapped in self._file.signals.items():
             self._add(name, mapped)
@@ -89,12 +83,14 @@ class Mapping:
         self._faults.append(f"{self.path}: signals.{key}: {text}")
 
     def _add(self, name: str, mapped: Mapped) -> None:
+        from cantools.database import Error
+
         message_name, _, signal_name = name.partition(".")
         if message_name not in self._ours or (message_name.startswith("EMB_") and not is_received(message_name)):
             return self._fault(name, "expected Message.Signal of what the daemon receives, such as EMB_FL_Resolver.MotorAngle")
-        ours = {signal.name: signal for signal in self._ours[message_name][0].signals}.get(signal_name)
-        if ours is None or signal_name in HEADER:
-            return self._fault(name, f"{message_name} has no such signal to map; it has {self._signals_of(message_name)}")
+        every = {signal.name: signal for signal in self._ours[message_name][0].signals if signal.name not in HEADER}
+        if (ours := every.get(signal_name)) is None:
+            return self._fault(name, f"{message_name} has no such signal to map; it has {', '.join(every)}")
         signals = self.messages.setdefault(message_name, {})
         if mapped.value is not None:
             signals[signal_name] = mapped.value
@@ -113,8 +109,8 @@ class Mapping:
         except KeyError:
             text = f"{mapped.signal}: the rig's DBC has no such message and signal"
             return self._fault(name, text + self._like(mapped.bus, mapped.signal))
-        if self.databases and (fault := self._misfit(mapped.bus, mapped.signal)):
-            return self._fault(name, f"{mapped.signal}: the rig's DBC contradicts itself: {fault}")
+        except Error as error:
+            return self._fault(name, f"{mapped.signal}: the rig's DBC contradicts itself: {error}")
         unit = (stated if mapped.unit is None else mapped.unit).strip()
         if (unit in TRAVELS or UNITS.get(unit, ("",))[0] == "m/s") and ours.unit in ("rad", "rad/s"):
             if message_name == "VEH_WheelSpeed":
@@ -138,9 +134,6 @@ class Mapping:
         signals[signal_name] = source
         return None
 
-    def _signals_of(self, message: str) -> str:
-        return ", ".join(signal.name for signal in self._ours[message][0].signals if signal.name not in HEADER)
-
     def _like(self, bus: str | None, signal: str) -> str:
         """The most similar names in the rig's DBC, in words; empty if there are none."""
         known = [f"{message.name}.{theirs.name}" for message in self.databases[bus].messages for theirs in message.signals]
@@ -151,20 +144,14 @@ class Mapping:
         return f"; did you mean {' or '.join(like)}?" if like else ""
 
     def _their_unit(self, bus: str | None, signal: str) -> str:
-        """Of a signal as the rig describes it, empty if it does not. Raises KeyError: the rig's DBC has no such signal."""
+        """Of a signal as the rig describes it, empty if it does not. Raises KeyError: the rig's DBC has no such signal, or
+        cantools' Error: it cannot be read."""
         if not self.databases:
             return ""
-        return self._message(bus, signal).get_signal_by_name(signal.rpartition(".")[2]).unit or ""
-
-    def _misfit(self, bus: str | None, signal: str) -> str:
-        """Why a signal of the rig's cannot be read, empty if it can."""
-        from cantools.database import Error
-
-        try:
-            alone(self._message(bus, signal), signal.rpartition(".")[2])
-        except Error as error:
-            return str(error)
-        return ""
+        message, own = self._message(bus, signal), signal.rpartition(".")[2]
+        unit = message.get_signal_by_name(own).unit or ""
+        alone(message, own)
+        return unit
 
     def _message(self, bus: str | None, signal: str):
         return self.databases[bus].get_message_by_name(signal.rpartition(".")[0])

@@ -37,11 +37,8 @@ class Mapped(Struct, kw_only=True):
     def __post_init__(self) -> None:
         if (self.signal is None) == (self.value is None):
             raise ValueError("expected either signal (of the rig) or value (a constant)")
-        alone = (self.unit, self.bus, self.period, self.mean_ms) == (None, None, None, None) and (self.scale, self.offset) == (
-            1.0,
-            0.0,
-        )
-        if self.value is not None and not alone:
+        others = (self.unit, self.bus, self.period, self.mean_ms, self.scale, self.offset)
+        if self.value is not None and others != (None, None, None, None, 1.0, 0.0):
             raise ValueError("value: stands alone, in our unit")
         if self.scale == 0.0:
             raise ValueError("scale: 0 leaves nothing of the signal")
@@ -104,11 +101,8 @@ class MappingFile(Struct, kw_only=True):
 
 class Source:
     """One foreign signal of a bus (None: the only one), its ``name`` in a DBC ``message`` and ``signal``, and how it becomes
-    ours: ``scale`` and ``offset`` from the rig's ``unit`` to our ``target``, ``span_ns`` None is a sampling period.
-
-    Raises:
-        InputError: the unit cannot become ours.
-    """
+    ours: ``scale`` and ``offset`` from the rig's ``unit`` to our ``target``, ``span_ns`` None is a sampling period. Raises
+    InputError: the unit cannot become ours."""
 
     def __init__(self, mapped: Mapped, unit: str, target: str, span_ns: float | None):
         self.name: str = mapped.signal

@@ -5,7 +5,7 @@ That alone may be a motor that is turned round at once; load and acceleration te
 
 import numpy as np
 
-from emb_daemon.logs.currents import JUDGED, LEAST
+from emb_daemon.logs.currents import JUDGED, LEAST, left_of
 from emb_daemon.logs.series import Series
 
 #: Least step from one end of a number to the other, as a share of its range: less than the rest passes within a sample. Least
@@ -20,17 +20,12 @@ _FITS = 10
 
 
 def overflown(current: Series, speed: Series, force: Series | float) -> np.ndarray:
-    """Samples of a current that were recorded as another, because their number was full, shape (n,).
+    """Samples of a current that were recorded as another, because their number was full, shape (n,); ``force``: the motor's
+    load.
 
     Stretches between two steps from one end of the range to the other are held against what load, friction and acceleration
     need: they are overflown if nearer to it from beyond the end, and most of those clearly. Beside one the values at the ends
-    themselves are taken for more, too.
-
-    Args:
-        current: the recorded one.
-        speed: the motor's.
-        force: its load, or a constant one.
-    """
+    themselves are taken for more, too."""
     values, steps = current.values, np.diff(current.values)
     nothing = np.zeros(len(values), bool)
     whole = float(np.ptp(values)) if len(values) >= LEAST else 0.0
@@ -71,10 +66,7 @@ def overflown(current: Series, speed: Series, force: Series | float) -> np.ndarr
     undone = values + jump * np.where(full, beyond[stretch], 0.0)
     needed = columns @ np.linalg.lstsq(columns[known], undone[known])[0]
     clear = np.abs(missing(needed) - taken) < _CLEAR
-
-    def left_A(columns: np.ndarray, values: np.ndarray) -> float:
-        return float(np.std(values - columns @ np.linalg.lstsq(columns, values)[0]))
-
-    explained = 1.0 - (left_A(columns[right], values[right]) / left_A(rest[right], values[right])) ** 2
+    left_A, of_rest_A = (float(np.std(left_of(values[right], by[right]))) for by in (columns, rest))
+    explained = 1.0 - (left_A / of_rest_A) ** 2
     sure = np.sum(count[clear & taken]) > _MOST_CLEAR * np.sum(count[taken])
     return full | at_end if explained > _EXPLAINED and sure else nothing

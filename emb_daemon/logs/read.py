@@ -249,11 +249,8 @@ def read_frames(path: str | Path) -> np.ndarray:
 
     They stand in file order; those of a log whose resolver has another rate than ours are brought to it
     (`resample.at_our_rate`), with a word on stderr. The format goes by how the file begins or, where that tells nothing, by
-    the last ending alone (before ``.gz``), so that names with dots in them are fine.
-
-    Raises:
-        InputError: missing, damaged, empty or unknown file; names the file and the line where there are lines.
-    """
+    the last ending alone (before ``.gz``), so that names with dots in them are fine. Raises InputError: missing, damaged,
+    empty or unknown file; names the file and the line where there are lines."""
     return read_with_digest(path)[0]
 
 

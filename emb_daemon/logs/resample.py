@@ -70,10 +70,8 @@ HEADER = ("CRC", "Counter", "Status")
 #: Cycle of a message whose DBC states none, ms.
 _SLOW_MS = 40
 
-
 #: Signals of one of our messages: where they come from, a constant, or None for an instrument that the rig does not have.
 Signals = Mapping[str, Series | float | None]
-
 
 #: By the last word of a message's name: which of its signals may be missing, and their substitutes.
 SUBSTITUTES = {
@@ -192,8 +190,7 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
     """FRAME array, in time order, of our messages by name.
 
     The resolver's samples are the clock of their corner. A message's signals that are left out are sent as zero, or as absent
-    if a rig's instrument gives them.
-    """
+    if a rig's instrument gives them."""
     ours = our_messages()
     ticks = {}
     for corner in CORNERS:
@@ -213,8 +210,7 @@ def frames_of(messages: Mapping[str, Signals]) -> np.ndarray:
 def at_our_rate(frames: np.ndarray) -> np.ndarray:
     """Frames of a log in our own layout; if a resolver in it has another rate, above 50 Hz, all brought to ours.
 
-    Frames with a wrong CRC, or whose sender says not to use them, are then left out.
-    """
+    Frames with a wrong CRC, or whose sender says not to use them, are then left out."""
     decoder = Decoder()
     resolvers = [frames["can_id"] == decoder.can_id(f"EMB_{corner}_Resolver") for corner in CORNERS]
     if not any(_has_another_rate(frames[mine]) for mine in resolvers):

@@ -43,8 +43,7 @@ def longest_step_ns(period_ns: float) -> float:
 class Series:
     """One signal, in our unit: int64 nanoseconds, ascending, and float values, shape (n,).
 
-    Each value is that of its time, or a mean about it.
-    """
+    Each value is that of its time, or a mean about it."""
 
     time_ns: np.ndarray
     values: np.ndarray
@@ -139,8 +138,7 @@ class Series:
         """Of a slow signal: mean over a period about each time, NaN in gaps.
 
         Its change over a cycle is then that of means over periods, interpolated between their middles, as in `mean` for the
-        current, so that speed and current of a slow rig give the same inertia.
-        """
+        current, so that speed and current of a slow rig give the same inertia."""
         half = round(0.5 * self.period_ns)
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
@@ -155,8 +153,7 @@ class Series:
         """Mean over the cycle that ends at each time, NaN in gaps.
 
         A value that is sampled at our rate represents the period about its time, so that means over periods add up to means
-        over cycles; slower values are interpolated linearly.
-        """
+        over cycles; slower values are interpolated linearly."""
         if not len(self.time_ns):
             return np.full(len(at_ns), np.nan)
         middle = at_ns - CYCLE_NS // 2

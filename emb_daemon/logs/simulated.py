@@ -1,11 +1,8 @@
 """The simulated car on another rig's bus: our frames are sent as the rig's messages, by the mapping that reads them."""
 
-from typing import Any
-
 import numpy as np
 
 from emb_daemon.errors import InputError
-from emb_daemon.logs.live import open_buses
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.mapping_file import Source
 from emb_daemon.logs.resample import our_messages
@@ -28,7 +25,6 @@ class _Theirs:
         self.missing.discard(name)
 
     def frame(self):
-        """A python-can Message."""
         import can
 
         data = self.message.encode(self.values, strict=False)
@@ -40,24 +36,15 @@ def _bounds(signal) -> tuple[float, float]:
     """Range of a cantools signal."""
     if signal.is_float:
         return -np.inf, np.inf
-    least, most = (
-        (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
-    )
-    ends = least * signal.scale + signal.offset, most * signal.scale + signal.offset
+    least = -(1 << signal.length - 1) if signal.is_signed else 0
+    ends = [raw * signal.scale + signal.offset for raw in (least, least + (1 << signal.length) - 1)]
     return min(ends), max(ends)
 
 
 class SimulatedRig(PythonCanBus):
-    """A bus that sends our frames as the rig's messages.
-
-    Args:
-        bus: python-can's, opened for CAN FD where the rig's messages need it.
-        mapping: by the rig's DBC.
-        ids: of the frames to receive, unchanged.
-
-    Raises:
-        InputError: a mapping of tables has no frames, and one signal cannot select what else its message holds.
-    """
+    """A bus that sends our frames as the rig's messages, on python-can's, opened for CAN FD where these need it, and receives
+    frames of ``ids`` unchanged. Raises InputError: a mapping of tables has no frames, and one signal cannot select what else
+    its message holds."""
 
     def __init__(self, bus: PythonCan, mapping: Mapping, ids: list[int]):
         super().__init__(bus, ids)
@@ -90,8 +77,3 @@ class SimulatedRig(PythonCanBus):
         for theirs in changed.values():
             if not theirs.missing:
                 self._hand_over(theirs.frame())
-
-
-def open_simulated(options: dict[str, Any], mapping: Mapping, ids: list[int]) -> SimulatedRig:
-    """A bus by python-can's options (`cli.options.bus_options`); errors as in `logs.live.open_buses`."""
-    return SimulatedRig(open_buses(options, mapping), mapping, ids)

@@ -64,15 +64,8 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
     """Times of a recording, int64 ns and rising, and the rows that they belong to.
 
     Repeated samples are left out. Stamps in bunches, from a coarse clock or from bursts of a queue, are spread evenly. Both
-    are reported on stderr.
-
-    Args:
-        source: what messages call it.
-        columns: of values, shape (n,) each, by which repetitions are recognised.
-
-    Raises:
-        InputError: time goes back by more than a second, begins anew again and again, or does not pass.
-    """
+    are reported on stderr. ``source``: what messages call it; ``columns``: of values, shape (n,) each, by which repetitions
+    are recognised. Raises InputError: time goes back by more than a second, begins anew again and again, or does not pass."""
     rows = np.arange(len(time_ns))
     if len(back := np.flatnonzero(np.diff(time_ns) < -_BACK_NS)):
         by = 1e-9 * float(time_ns[back[0]] - time_ns[back[0] + 1])

@@ -53,13 +53,8 @@ def read_table(
     path: Path, names: list[str], time: Time | None
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[str, str], str]:
     """Times (int64 ns) and values of the named columns or channels, the units that the file states of them, and its SHA-256.
-
-    Args:
-        time: the column of times of a table; None for a measurement.
-
-    Raises:
-        InputError: unreadable, or without one of the columns, or one that holds no numbers.
-    """
+    ``time``: the column of times of a table; None for a measurement. Raises InputError: unreadable, or without one of the
+    columns, or one that holds no numbers."""
     raw = read_file(path)
     ending = log_ending(path)
     content, digest = unpack(path, raw), hashlib.sha256(raw).hexdigest()

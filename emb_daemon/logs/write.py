@@ -22,9 +22,9 @@ from emb_daemon.wire.layout import CORNERS
 TABLE_ENDINGS = (".csv", ".parquet", ".signals.mf4")
 FRAME_ENDINGS = (".log", ".blf", ".asc", ".trc", ".mf4")
 
-
-#: Descriptions of table columns that are no signals of the estimator, for formats that can store them.
-_COMMENTS = {"reasons": "why not to trust the row, joined by '; '", "corner": "wheel"}
+#: Descriptions of table columns, for formats that can store them.
+_COMMENTS = {signal.name: signal.meaning for signal in OUTPUTS}
+_COMMENTS |= {"reasons": "why not to trust the row, joined by '; '", "corner": "wheel"}
 _UNITS = {"N": "N", "Nm": "Nm", "rad": "rad", "C": "degC"}
 #: Signals without a column.
 _NOT_WRITTEN = ("stiffness_force_sigma_N", "torque_force_sigma_N", "contact_angle_sigma_rad", "reasons", "facts")
@@ -86,12 +86,6 @@ def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
     write_atomically(path, memoryview(sink.getvalue()))
 
 
-def _unit_and_comment(name: str) -> tuple[str, str]:
-    signal = next((signal for signal in OUTPUTS if signal.name == name), None)
-    comment = "reference instrument of the rig" if "_ref_" in name else _COMMENTS.get(name) or (signal and signal.meaning)
-    return _UNITS.get(name.rpartition("_")[2], ""), comment or ""
-
-
 def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
     """MDF4 as measurement tools open it: one channel group, channels with unit and comment, texts as value tables."""
     try:
@@ -104,7 +98,8 @@ def _write_measurement(path: Path, columns: dict[str, np.ndarray]) -> None:
     for name, values in columns.items():
         if name == "time_s":
             continue
-        unit, comment = _unit_and_comment(name)
+        unit = _UNITS.get(name.rpartition("_")[2], "")
+        comment = "reference instrument of the rig" if "_ref_" in name else _COMMENTS.get(name, "")
         conversion = None
         if values.dtype.kind in "UO":
             texts, values = np.unique(values, return_inverse=True)

@@ -32,22 +32,17 @@ SECOND_NS = 1_000_000_000
 
 @dataclass
 class Stream:
-    """One of a corner's four messages.
-
-    Attributes:
-        values: signals of the last good frame in the DBC's order and units; empty before the first.
-        received, missing, damaged: good frames; frames missing by the counter, complete turns of which show in the elapsed
-        time; frames with a wrong CRC or a repeated counter.
-    """
+    """One of a corner's four messages."""
 
     cycle_ns: int
+    #: Signals of the last good frame in the DBC's order and units; empty before the first.
     values: list[float] = field(default_factory=list)
     status: int = contract.STATUS_NOT_AVAILABLE
     counter: int = -1
     time_ns: int = 0
-    received: int = 0
-    missing: int = 0
-    damaged: int = 0
+    received: int = 0  #: good frames
+    missing: int = 0  #: by the counter; complete turns of it show in the elapsed time
+    damaged: int = 0  #: frames with a wrong CRC or a repeated counter
 
     @property
     def usable(self) -> bool:
@@ -216,7 +211,6 @@ class Listener:
         return {corner.name: corner.state(now_ns) for corner in self.active}
 
     def reset(self) -> None:
-        """Forget everything."""
         self.corners: list[Corner] = [Corner(name, self._cycles) for name in CORNERS]
 
     def receive(self, frames: np.ndarray) -> None:

@@ -31,19 +31,9 @@ def state(listener: Listener, now_ns: int) -> dict[str, Any]:
     return {"timestamp": time.time(), "corners": listener.states(now_ns)}
 
 
-def _forces(current: dict) -> list:
-    """The part of a `state` that a plot draws."""
-    names = ("clamp_force_kN", "clamp_force_sigma_kN")
-    return [current["timestamp"], {corner: [now[name] for name in names] for corner, now in current["corners"].items()}]
-
-
 class Web:
-    """Serves one page, its events and metrics, to this machine only.
-
-    Args:
-        port: 0 for any that is free; it is then the attribute `port`.
-        title: name of the bus on the page.
-    """
+    """Serves one page, its events and metrics, to this machine only. Port 0 is any that is free; it is then the attribute
+    `port`. ``title``: name of the bus on the page."""
 
     def __init__(self, port: int, title: str):
         """Raises Unavailable if the port is taken."""
@@ -75,7 +65,9 @@ class Web:
         with self._news:
             self._shown_s = time.monotonic()
             current = state(listener, now_ns)
-            self._history.append(_forces(current))
+            # The part that a plot draws.
+            forces = {name: [now["clamp_force_kN"], now["clamp_force_sigma_kN"]] for name, now in current["corners"].items()}
+            self._history.append([current["timestamp"], forces])
             self._state, self._metrics = json.dumps(current).encode(), exposition(listener, now_ns).encode()
             self._news.notify_all()
 

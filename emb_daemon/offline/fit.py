@@ -20,65 +20,47 @@ Values = dict[Hashable, float]
 
 @dataclass(frozen=True)
 class Free:
-    """A parameter to be fitted.
+    """A parameter to be fitted."""
 
-    Attributes:
-        start: where the search begins.
-        step: of the derivative's difference quotient: small, but large enough to change the residual.
-        low, high: bounds.
-        prior: (mean, standard deviation) of what is known beforehand; residuals then have to be in units of their own standard
-            deviation, or the two are not weighted correctly.
-        logarithmic: searched as a logarithm, for positive parameters of unknown size. ``step`` and the prior's deviation are
-            then relative, and the prior's mean is still a value.
-    """
-
-    start: float
-    step: float
+    start: float  #: where the search begins
+    step: float  #: of the derivative's difference quotient: small, but large enough to change the residual
     low: float = -np.inf
     high: float = np.inf
+    #: (mean, standard deviation) of what is known beforehand; residuals then have to be in units of their own standard
+    #: deviation, or the two are not weighted correctly.
     prior: tuple[float, float] | None = None
+    #: Searched as a logarithm, for positive parameters of unknown size. ``step`` and the prior's deviation are then relative,
+    #: and the prior's mean is still a value.
     logarithmic: bool = False
 
 
 @dataclass(frozen=True)
 class Block:
-    """Residuals of one log.
+    """Residuals of one log."""
 
-    Attributes:
-        residual: from values by key (those in ``keys`` at least) to residuals, shape (n,), all finite. Those of several blocks
-            are asked at once.
-        keys: parameters that these residuals depend on; only they are moved for the derivative.
-        episode: number of the episode of each residual, ascending, shape (n,). Residuals are autocorrelated within an episode
-            and nearly independent between episodes, so that the covariance is computed over episodes.
-        derivative: from values to the derivatives of the residuals, shape (n, keys), if they are known better than by
-            difference quotients.
-    """
-
+    #: From values by key (those in ``keys`` at least) to residuals, shape (n,), all finite. Those of several blocks are asked
+    #: at once.
     residual: Callable[[Values], np.ndarray]
-    keys: tuple[Hashable, ...]
+    keys: tuple[Hashable, ...]  #: parameters that these residuals depend on; only they are moved for the derivative
+    #: Number of the episode of each residual, ascending, shape (n,). Residuals are autocorrelated within an episode and nearly
+    #: independent between episodes, so that the covariance is computed over episodes.
     episode: np.ndarray
+    #: From values to the derivatives of the residuals, shape (n, keys), if they are known better than by difference quotients.
     derivative: Callable[[Values], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of a fit.
-
-    Attributes:
-        values: by key.
-        sigmas: standard deviations by key, infinite where neither residuals nor prior determine it.
-        covariance: of the values, in the order of ``keys``: jackknife over episodes (one Gauss-Newton step for each left out;
-            Wu, Annals of Statistics 14, 1986), which is not too small with few episodes, and the priors' part.
-        residuals: one array per block.
-        from_prior: share of each parameter's information that is its prior's, 0 to 1.
-    """
+    """Result of a fit."""
 
     keys: tuple[Hashable, ...]
-    values: Values
-    sigmas: Values
+    values: Values  #: by key
+    sigmas: Values  #: standard deviations by key, infinite where neither residuals nor prior determine it
+    #: Of the values, in the order of ``keys``: jackknife over episodes (one Gauss-Newton step for each left out; Wu, Annals of
+    #: Statistics 14, 1986), which is not too small with few episodes, and the priors' part.
     covariance: np.ndarray
-    residuals: list[np.ndarray] = field(repr=False)
-    from_prior: Values
+    residuals: list[np.ndarray] = field(repr=False)  #: one array per block
+    from_prior: Values  #: share of each parameter's information that is its prior's, 0 to 1
 
     @property
     def rms(self) -> float:
@@ -92,12 +74,8 @@ class Fit:
 
 
 def fit(blocks: Sequence[Block], free: Mapping[Hashable, Free], *, tolerance: float = 1e-8, evaluations: int = 100) -> Fit:
-    """Least-squares estimate.
-
-    Args:
-        tolerance: relative fall of the cost that ends the search.
-        evaluations: limit of the residual's evaluations, not counting derivatives.
-    """
+    """Least-squares estimate. ``tolerance``: relative fall of the cost that ends the search; ``evaluations``: limit of the
+    residual's evaluations, not counting derivatives."""
     problem = _Problem(blocks, free)
     low, high = problem.bounds()
     found = least_squares(
@@ -236,18 +214,13 @@ class _Problem:
 
 
 def jackknife(normals: np.ndarray, scores: np.ndarray, prior: np.ndarray | None = None) -> np.ndarray:
-    """Covariance of the solution of estimating equations that episodes add up to.
+    """Covariance, shape (n, n), of the solution of estimating equations that episodes add up to: each is left out in turn, and
+    one Gauss-Newton step taken from the solution of all. The variance is infinite where neither episodes nor prior say
+    anything.
 
-    Each episode is left out in turn, and one Gauss-Newton step taken from the solution of all.
-
-    Args:
-        normals: minus the derivative of each episode's score, shape (episodes, n, n); for least squares J'J.
-        scores: of each episode at the solution, shape (episodes, n); for least squares J'r.
-        prior: inverse covariance of what is known beside the episodes, shape (n, n).
-
-    Returns:
-        Shape (n, n); infinite variance where neither episodes nor prior say anything.
-    """
+    ``normals``: minus the derivative of each episode's score, shape (episodes, n, n), for least squares J'J; ``scores`` at the
+    solution, shape (episodes, n), for least squares J'r; ``prior``: inverse covariance of what is known beside the
+    episodes."""
     total = normals.sum(axis=0) if prior is None else normals.sum(axis=0) + prior
     information = np.abs(np.diag(total))
     known = information > 0.0

@@ -28,8 +28,7 @@ def integral_time(series: list[np.ndarray]) -> float:
     """Correlation time of an error, s: the integral of its autocorrelation up to the first lag at which it counts as zero.
 
     A first-order process with this time constant has the error's spectral density at low frequency, where the filter works; a
-    white part of the error makes it shorter.
-    """
+    white part of the error makes it shorter."""
     covariance = autocorrelation(series, min(_LAGS, min(len(s) for s in series) // 4))
     correlation = covariance / covariance[0]
     gone = np.flatnonzero(correlation < _GONE)
@@ -59,12 +58,8 @@ def lasting_share(pairs: Iterable[tuple[np.ndarray, np.ndarray]], largest: float
     constant is subtracted.
 
     Both halves of a manoeuvre have the same lasting error and independent noise, so that the mean product of their errors is
-    its variance.
-
-    Args:
-        pairs: error and load of gap-free series, one value for each cycle, in the same unit.
-        largest: the load of the largest force.
-    """
+    its variance. ``pairs``: error and load of gap-free series, one value for each cycle, in the same unit; ``largest``: the
+    load of the largest force."""
     products = []
     for error, load in pairs:
         count = len(load) // _MANOEUVRE

@@ -25,8 +25,7 @@ _NEAR_NS = 2_000_000
 class SlowChannels:
     """Messages with a longer period than the motor's, at their own times, with the signal names of dbc/emb.dbc.
 
-    Each holds ``time_ns`` and the message's signals, shape (n,); frames with a wrong CRC are left out.
-    """
+    Each holds ``time_ns`` and the message's signals, shape (n,); frames with a wrong CRC are left out."""
 
     thermocouples: dict[str, np.ndarray]
     wheel_speed: dict[str, np.ndarray]
@@ -35,22 +34,15 @@ class SlowChannels:
 
 @dataclass(frozen=True)
 class Log:
-    """One corner's samples of a log, and what its reference instruments measured.
-
-    Attributes:
-        samples: SAMPLE array, one row per resolver sample; ``brake_torque`` is NaN, as in a car.
-        time_ns: of each sample, on the log's clock.
-        reference: rig instruments; empty in a car.
-        force_N: reference clamp force at each sample, NaN where none was recorded.
-        frames: FRAME array of the slow messages, from which `slow` is decoded when it is used.
-    """
+    """One corner's samples of a log, and what its reference instruments measured."""
 
     path: Path
     corner: str
-    samples: np.ndarray
-    time_ns: np.ndarray
-    reference: References
-    force_N: np.ndarray
+    samples: np.ndarray  #: SAMPLE array, one row per resolver sample; ``brake_torque`` is NaN, as in a car
+    time_ns: np.ndarray  #: of each sample, on the log's clock
+    reference: References  #: rig instruments; empty in a car
+    force_N: np.ndarray  #: reference clamp force at each sample, NaN where none was recorded
+    #: FRAME array of the slow messages, from which `slow` is decoded when it is used.
     frames: np.ndarray = field(default_factory=lambda: np.zeros(0, FRAME), repr=False)
 
     @property

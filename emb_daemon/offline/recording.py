@@ -32,30 +32,20 @@ _COARSE_S = 0.5
 class Recording:
     """What heats and cools the pads, on an even grid, and what was measured in them.
 
-    Arrays have shape (n,) unless stated; temperatures in degC. Means hold for the step that starts at their row.
-
-    Attributes:
-        step_s: grid.
-        inner, outer: backing plates; the air, where nothing of the pads was measured.
-        power: mean friction power, W, from the brake torque sensor.
-        touching: pads press on the disc.
-        speed: mean wheel speed, rad/s.
-        force: mean reference clamp force, N.
-        measured: shape (9, n): inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; NaN where there is none.
-        dense: force and torque were recorded often enough for a friction coefficient at each row.
-    """
+    Arrays have shape (n,) unless stated; temperatures in degC. Means hold for the step that starts at their row."""
 
     name: str
-    step_s: float
+    step_s: float  #: grid
+    #: ``inner`` and ``outer``: backing plates; the air, where nothing of the pads was measured.
     inner: np.ndarray
     outer: np.ndarray
     ambient: np.ndarray
-    power: np.ndarray
-    touching: np.ndarray
-    speed: np.ndarray
-    force: np.ndarray
-    measured: np.ndarray
-    dense: bool
+    power: np.ndarray  #: mean friction power, W, from the brake torque sensor
+    touching: np.ndarray  #: pads press on the disc
+    speed: np.ndarray  #: mean wheel speed, rad/s
+    force: np.ndarray  #: mean reference clamp force, N
+    measured: np.ndarray  #: shape (9, n): inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; NaN where there is none
+    dense: bool  #: force and torque were recorded often enough for a friction coefficient at each row
 
     @property
     def time_s(self) -> np.ndarray:
@@ -95,12 +85,8 @@ def recording(log: Log) -> Recording:
     """Inputs and thermocouples of a log on an even grid.
 
     Motor frames of thermal logs are rare, so that vehicle and thermocouple frames are taken at their own rate: a brake
-    application that ends a second late would heat the disc by degrees.
-
-    Raises:
-        InputError: no wheel speed, force or torque in the log, no temperature of pads or disc, or of pads without their
-            backing plates.
-    """
+    application that ends a second late would heat the disc by degrees. Raises InputError: no wheel speed, force or torque in
+    the log, no temperature of pads or disc, or of pads without their backing plates."""
     reference, slow = log.reference, log.slow
     channels = [(stamps, row) for stamps, depths in (reference.pads["inner"], reference.pads["outer"]) for row in depths]
     channels.append((reference.time_ns, reference.disc_C))
@@ -229,17 +215,12 @@ def _advance(s, p, m, longest, inner, outer, ambient):
 def simulate(
     parameters: np.void, r: Recording, torque_known: bool = True, every: int = 1, signals: np.ndarray | None = None
 ) -> np.ndarray:
-    """Temperatures by the estimator's heat chain, with effects and terms, over a recording, every ``every``-th row.
+    """Temperatures (degC, shape (rows, 13): the nine of `Recording.measured`, both pad surfaces, both pad means) by the
+    estimator's heat chain, with effects and terms, over a recording, every ``every``-th row; heated by the brake torque sensor
+    if ``torque_known``, else by the friction table and the reference force.
 
-    Args:
-        parameters: PARAMETERS.
-        torque_known: heat by the brake torque sensor, else by the friction table and the reference force.
-        signals: shape (n, signals), filled with what terms see (`effects.terms.SIGNALS`) at every row; what a recording does
-            not hold is zero or no number.
-
-    Returns:
-        Shape (rows, 13), degC: the nine of `Recording.measured`, both pad surfaces, both pad means.
-    """
+    ``signals``, shape (n, signals), is filled with what terms see (`effects.terms.SIGNALS`) at every row; what a recording
+    does not hold is zero or no number."""
     own, out = np.atleast_1d(parameters), np.empty((-(-len(r.power) // every), 13))
     if signals is None:
         signals = np.zeros((0, len(SIGNALS)))

@@ -72,12 +72,8 @@ def _run_paths(samples, factor, parameters, states, force, out):
 
 
 def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarray:
-    """Both force paths of cold pads, the contact angle held; returns PATHS rows.
-
-    Args:
-        samples: SAMPLE rows, shape (n,), or any rows with their fields.
-        parameters: one PARAMETERS record, or an array of shape (1,).
-    """
+    """Both force paths of cold pads, the contact angle held; returns PATHS rows. ``samples``: SAMPLE rows, or
+    any rows with their fields; ``parameters``: one PARAMETERS record, or an array of shape (1,)."""
     force, out = np.empty(len(samples)), np.zeros(len(samples), PATHS)
     _run_paths(samples, _COLD, np.atleast_1d(parameters), np.zeros(1, STATE), force, out)
     out["force"] = force
@@ -87,8 +83,7 @@ def run_paths(samples: np.ndarray, parameters: np.ndarray | np.void) -> np.ndarr
 def stiffness_force(samples: np.ndarray, parameters: np.ndarray | np.void, factor: np.ndarray = _COLD) -> np.ndarray:
     """Clamp force in N by the stiffness path alone, at half the cost of `run_paths`.
 
-    Arguments as there; ``factor`` of the stiffness has shape (1,) for all rows or (n,).
-    """
+    Arguments as there; ``factor`` of the stiffness has shape (1,) for all rows or (n,)."""
     force = np.empty(len(samples))
     _run_paths(samples, factor, np.atleast_1d(parameters), np.zeros(1, STATE), force, np.zeros(0, PATHS))
     return force
@@ -124,8 +119,7 @@ def _run_step(samples, parameters, states, estimate, out, heat):
 def held(parameters: np.ndarray | np.void) -> np.ndarray:
     """PARAMETERS, shape (1,), with which the step does not learn the contact angle.
 
-    Learning would spread an error of one path over both, and hide a slow effect in a changing contact angle.
-    """
+    Learning would spread an error of one path over both, and hide a slow effect in a changing contact angle."""
     fixed = np.atleast_1d(parameters).copy()
     fixed["clearance_sigma"] = 0.0
     fixed["contact_walk"] = 0.0
@@ -135,8 +129,7 @@ def held(parameters: np.ndarray | np.void) -> np.ndarray:
 def run_step(samples: np.ndarray, parameters: np.ndarray | np.void, heat: np.ndarray = _UNASKED) -> np.ndarray:
     """The whole step from power-on; returns TRACE rows, what `estimate` does not tell. Residuals want `held` parameters.
 
-    Fills ``heat``, as many HEAT rows as samples, if it is given.
-    """
+    Fills ``heat``, as many HEAT rows as samples, if it is given."""
     out = np.zeros(len(samples), TRACE)
     _run_step(samples, np.atleast_1d(parameters), new_state(), np.zeros(1, ESTIMATE), out, heat)
     return out
@@ -148,13 +141,9 @@ def estimate(
     state: np.ndarray | None = None,
     adaptation: Adaptation | None = None,
 ) -> np.ndarray:
-    """The whole step as the daemon runs it; returns ESTIMATE rows.
-
-    Args:
-        parameters: one PARAMETERS record, or an array of one record for each corner or one in all.
-        state: STATE, one or four, carried on if given.
-        adaptation: `adapt.adaptation.Adaptation` that learns meanwhile.
-    """
+    """The whole step as the daemon runs it; returns ESTIMATE rows. ``parameters``: one PARAMETERS record, or an array of one
+    record for each corner or one in all; ``state``: STATE, one or four, carried on if given; ``adaptation``:
+    `adapt.adaptation.Adaptation` that learns meanwhile."""
     estimates = np.zeros(len(samples), ESTIMATE)
     answer_all = adaptation.answer if adaptation else answer
     answer_all(samples, len(samples), new_state() if state is None else state, np.atleast_1d(parameters), estimates)

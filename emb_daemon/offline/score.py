@@ -118,17 +118,12 @@ def temperature_figures(time_ns: np.ndarray, estimates: np.ndarray, reference: R
 
 @dataclass(frozen=True)
 class EpisodeErrors:
-    """Squared errors by path, condition and episode, from which the RMSE over any choice of episodes follows.
-
-    Attributes:
-        sums: of squared errors, shape (paths, conditions, episodes); the last condition is "total".
-        counts: samples, same shape.
-    """
+    """Squared errors by path, condition and episode, from which the RMSE over any choice of episodes follows."""
 
     paths: tuple[str, ...]
     conditions: tuple[str, ...]
-    sums: np.ndarray
-    counts: np.ndarray
+    sums: np.ndarray  #: of squared errors, shape (paths, conditions, episodes); the last condition is "total"
+    counts: np.ndarray  #: samples, same shape
 
     @classmethod
     def of(cls, errors: dict[str, np.ndarray], masks: dict[str, np.ndarray], episode: np.ndarray) -> "EpisodeErrors":

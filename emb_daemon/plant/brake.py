@@ -225,8 +225,7 @@ def clamp(p: Record, s: Record) -> None:
     """One sub-step of the clamp force: backlash, static curve, slip, relaxations.
 
     The first relaxation is the thesis's (3.3.2): force lags the motor angle, so that a fast stroke returns more work to the
-    motor than it took. It describes measured forces, not a passive material.
-    """
+    motor than it took. It describes measured forces, not a passive material."""
     e = p.effects
     angle = equivalent_angle(p, s.angle)
     if e.spindle_lead_error.amplitude_um != 0.0:

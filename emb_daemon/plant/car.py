@@ -12,18 +12,7 @@ from emb_daemon.logs.columns import DEPTHS_MM
 from emb_daemon.plant.brake import clamp, delayed_angle, delayed_mean_current, growth, motor_angle, move_motor, static_angle
 from emb_daemon.plant.controller import current_demand, set_target
 from emb_daemon.plant.heat import heat_cycle, pad_at, pad_mean
-from emb_daemon.plant.records import (
-    ANGLE,
-    CAR,
-    CYCLE_NS,
-    HISTORY,
-    PLANT,
-    PLANT_STATE,
-    SUBSTEP_S,
-    SUBSTEPS,
-    TRAINING,
-    TRUTH,
-)
+from emb_daemon.plant.records import ANGLE, CAR, CYCLE_NS, HISTORY, PLANT, PLANT_STATE, SUBSTEP_S, SUBSTEPS, TRAINING, TRUTH
 from emb_daemon.resources import resource
 from emb_daemon.wire import layout as wire
 from emb_daemon.wire.contract import CYCLE_S, PARK_APPLIED, PULSE_MODULO, PULSES_PER_TURN
@@ -366,16 +355,10 @@ class Car:
 
     Args:
         plants: PLANT array, one record per corner, in the order of ``corners``.
-        corners: numbers of these corners.
-        seed: of every random number from here on.
         reference: send the rig instruments' RIG_* frames too.
         start_ns: time of the first sample, less one cycle.
         ambient: degC; everything starts at this temperature.
         wheels_rad: that the wheels have turned by at most since their counters began, which they do at power-on.
-
-    Attributes:
-        truth: TRUTH array, one row per corner, of the last tick.
-        states, trainings, motion: PLANT_STATE and TRAINING arrays by corner, CAR array of shape (1,).
     """
 
     def __init__(
@@ -392,9 +375,10 @@ class Car:
             raise ValueError(f"{len(plants)} plants for {len(corners)} corners")
         self.plants: np.ndarray = np.ascontiguousarray(plants, PLANT)
         self.corners: tuple[str, ...] = tuple(corners)
+        #: ``states``, ``trainings`` and ``motion``: PLANT_STATE and TRAINING arrays by corner, CAR array of shape (1,).
         self.states: np.ndarray = _released_states(self.plants, ambient)
         self.trainings: np.ndarray = np.zeros(len(plants), TRAINING)
-        self.truth: np.ndarray = np.zeros(len(plants), TRUTH)
+        self.truth: np.ndarray = np.zeros(len(plants), TRUTH)  #: TRUTH array, one row per corner, of the last tick
         self._rng = rng = np.random.default_rng(seed)
         self.motion: np.ndarray = np.zeros(1, CAR)
         motion = self.motion[0]

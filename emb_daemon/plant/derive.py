@@ -70,18 +70,13 @@ def plant_from_calibration(
     effects: dict[str, dict[str, float]] | None = None,
     pad_thickness_mm: float | None = None,
 ) -> np.void:
-    """A PLANT record of the kind of brake that a calibration describes.
+    """A PLANT record of the kind of brake that a calibration describes, with unit-to-unit scatter of a ``seed``, or of the
+    calibration's own numbers. Raises InputError: the thickness is too far from the measured ones; KeyError: no such effect or
+    parameter.
 
-    Args:
-        seed: of the unit-to-unit scatter; None gives the calibration's own numbers.
-        effects: effects to switch on, with their parameters (`records.EFFECTS`); a parameter left out is zero. They are added
-            to those of the calibration, and replace effects of the same name.
-        pad_thickness_mm: of the pads mounted, if not the calibration's.
-
-    Raises:
-        InputError: the thickness is too far from the measured ones.
-        KeyError: no such effect or parameter.
-    """
+    ``effects`` are switched on, with their parameters (`records.EFFECTS`), of which one left out is zero; they are added to
+    those of the calibration, and replace effects of the same name. ``pad_thickness_mm``: of the pads mounted, if not the
+    calibration's."""
     p = np.zeros(1, PLANT)[0]
     for name, value in _UNSTATED.items():
         p[name] = value

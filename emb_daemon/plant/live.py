@@ -16,13 +16,9 @@ _LOST_NS = 2 * CYCLE_NS
 
 
 class LiveCar:
-    """Drives a schedule repeatedly, one cycle every 4 ms, and receives the daemon's frames between two cycles.
-
-    Attributes:
-        ticks: cycles run.
-        late: cycles that left more than half a cycle after their time, caused by the machine.
-        lost: cycles whose frames were not sent at all because their time had passed.
-    """
+    """Drives a schedule repeatedly, one cycle every 4 ms, and receives the daemon's frames between two cycles. ``ticks``:
+    cycles run; ``late``: cycles that left more than half a cycle after their time, caused by the machine; ``lost``: cycles
+    whose frames were not sent at all because their time had passed."""
 
     def __init__(self, car: Car, bus: Bus, schedule: Schedule):
         self.car = car
@@ -45,8 +41,7 @@ class LiveCar:
         """Run until ``stopped()`` or ``seconds`` are over.
 
         ``sent(time_ns, truth)`` is called after each cycle, with its TRUTH rows and the time when it left, 0 if it was lost;
-        ``received(frames)`` is called with the frames received since. Both views are valid during the call only.
-        """
+        ``received(frames)`` is called with the frames received since. Both views are valid during the call only."""
         last = None if seconds is None else round(seconds * 1e9 / CYCLE_NS)
         deadline = time.monotonic_ns()
         while not stopped() and self.ticks != last:

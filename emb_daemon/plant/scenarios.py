@@ -161,17 +161,8 @@ def simulate_log(
     reference: bool = True,
     **car_options: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A whole log at once, reproducible from its seed.
-
-    Args:
-        plants: PLANT record, or array with one record per corner.
-        seconds: length to which the schedule is cut or repeated; None: as it is.
-        reference: with the rig instruments' frames.
-        car_options: further arguments of `Car`.
-
-    Returns:
-        (FRAME array in order of time, TRUTH array of shape (cycles, corners)).
-    """
+    """A whole log at once, reproducible from its seed: FRAME array in order of time, with the rig instruments' frames if there
+    is a ``reference``, and TRUTH array, shape (cycles, corners). The schedule is cut or repeated to so many seconds."""
     car = Car(np.atleast_1d(plants), corners, seed, reference, **car_options)
     if seconds is not None:
         schedule = schedule.first(seconds)

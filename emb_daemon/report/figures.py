@@ -181,11 +181,7 @@ def _extent(panel: Panel) -> list[float] | None:
 
 class _Detail:
     """All samples of a figure's reduced traces, in base64 for the page's script; times that several traces share are stored
-    once.
-
-    Attributes:
-        times: by name, s, double precision.
-    """
+    once. ``times``: by name, s, double precision."""
 
     def __init__(self):
         self.times: dict[str, str] = {}

@@ -88,12 +88,7 @@ class Section:
 
 
 class Page:
-    """A report.
-
-    Args:
-        title: what it is.
-        subtitle: data, time and version. It must say if the data are simulated.
-    """
+    """A report. The subtitle states data, time and version, and must say if the data are simulated."""
 
     def __init__(self, title: str, subtitle: str = ""):
         self.title = title

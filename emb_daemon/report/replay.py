@@ -178,7 +178,6 @@ def _adaptation(page: Page, learned, calibration: Calibration) -> None:
 
 
 def _training(entry: "Entry") -> list:
-    """A row of the table of trainings."""
     figures = (("samples", 1.0, 0), ("residual_ratio", 1.0, 2), ("top_force_N", 1e-3, 1), ("force_sigma_N", 1.0, 0))
     numbers = [(entry.evidence.get(name), factor, digits) for name, factor, digits in figures]
     numbers += [(entry.ambient_C, 1.0, 0), (entry.pad_rise_K, 1.0, 0)]
@@ -198,12 +197,8 @@ def _curve(name: str, coefficients: np.ndarray, top_N: float, style: Style) -> T
 def replay_page(
     results: Sequence[Result], corner: str, calibration: Calibration, described: str, learned: "Store | None" = None
 ) -> Page:
-    """The page of one or more `replay.Result`, in sequence as one drive.
-
-    Args:
-        calibration: of the file; ``described`` in words.
-        learned: `adapt.memory.Store` of the corner after the drive, if it adapts.
-    """
+    """The page of one or more `replay.Result`, in sequence as one drive. ``calibration`` of the file, ``described`` in words;
+    ``learned``: `adapt.memory.Store` of the corner after the drive, if it adapts."""
     estimates = np.concatenate([result.estimates for result in results])
     force_N = np.concatenate([result.force_N for result in results])
     time_s = 1e-9 * (estimates["time_ns"] - estimates["time_ns"][0])

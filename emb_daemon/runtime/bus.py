@@ -24,15 +24,12 @@ _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
 
 
 class Bus(Protocol):
-    """A bus as the loop, the monitor and the workshop's servers use it; details are in `RawCanSocket` and `PythonCanBus`.
+    """A bus as the loop, the monitor and the workshop's servers use it; details are in `RawCanSocket` and `PythonCanBus`."""
 
-    Attributes:
-        dropped, unsent: frames that the receiver had no room for, and that the bus did not accept.
-        down, full: the bus cannot be used now; the last drain may have left frames waiting.
-    """
-
+    #: ``dropped`` and ``unsent``: frames that the receiver had no room for, and that the bus did not accept.
     dropped: int
     unsent: int
+    #: ``down`` and ``full``: the bus cannot be used now; the last drain may have left frames waiting.
     down: bool
     full: bool
 
@@ -156,12 +153,8 @@ class PythonCanBus:
 def open_bus(interface: str | None, channel: str | None, ids: list[int], **options: object) -> Bus:
     """Open the bus that the arguments, can.conf and the CAN_* variables name, receiving ``ids`` only.
 
-    SocketCAN goes through `RawCanSocket`, everything else through python-can.
-
-    Raises:
-        InputError: no interface is named, or an unknown one.
-        Unavailable: it cannot be opened now.
-    """
+    SocketCAN goes through `RawCanSocket`, everything else through python-can. Raises InputError: no interface is named, or an
+    unknown one. Raises Unavailable: it cannot be opened now."""
     chosen: dict[str, Any] = {"interface": interface, "channel": channel, **options}
     # python-can, which is slow to import, fills in what is not given.
     if interface != "socketcan" or not channel:

@@ -18,15 +18,12 @@ _WRITTEN, _SPAN_NS = 10, 10_000_000_000
 
 
 class ChangeLog:
-    """The journal's lines of each corner.
-
-    Attributes:
-        states: mode << 16 | reasons by corner, shape (4,), as they are now; -1 before the first estimate.
-        facts: what the estimator found (`estimator.status`) by corner, shape (4,), as it is now.
-    """
+    """The journal's lines of each corner."""
 
     def __init__(self):
+        #: Mode << 16 | reasons by corner, shape (4,), as they are now; -1 before the first estimate.
         self.states: np.ndarray = np.full(len(CORNERS), -1, np.int64)
+        #: What the estimator found (`estimator.status`) by corner, shape (4,), as it is now.
         self.facts: np.ndarray = np.zeros(len(CORNERS), np.int64)
         self._from_ns = [-_SPAN_NS] * len(CORNERS)
         self._changes = [0] * len(CORNERS)

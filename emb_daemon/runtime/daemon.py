@@ -26,7 +26,7 @@ from emb_daemon.jit import Array, compile_beside, compile_within, entry, njit
 from emb_daemon.pipeline import LATE_CYCLES, SHOWN_NS, Pipeline
 from emb_daemon.runtime.bus import Bus
 from emb_daemon.runtime.changes import ChangeLog
-from emb_daemon.runtime.journal import log
+from emb_daemon.runtime.journal import log, note
 from emb_daemon.runtime.pages import PATIENCE_S, Answer, PageListener, Request, socket_path
 from emb_daemon.runtime.reading import Reader, differing
 from emb_daemon.runtime.shared import SharedEstimates
@@ -52,10 +52,6 @@ _PATIENCE = 7_500
 #: Time for which a page that was read waits until the car is seen at rest: reading may have delayed the loop's reception.
 _SETTLING_NS = 500_000_000
 _OF_THE_LOOP = contract.BUS_DISTURBED | contract.DEADLINE_MISSED
-
-
-def _real_time(_time_ns: int) -> int:
-    return time.time_ns()
 
 
 class Pacer:
@@ -135,17 +131,8 @@ def _compile_fusion(scratch: Pipeline) -> None:
 
 
 class Daemon:
-    """Estimates of one process on one bus.
-
-    Args:
-        setup: checked configuration.
-        bus: what `runtime.bus.open_bus` or `runtime.rawcan.socket_pair` returns.
-        state: folder for learned values; without one nothing is learned.
-        reader: reads calibrations again at a reload.
-
-    Attributes:
-        ticks, missed: periods run, and periods in which the loop did not wake.
-    """
+    """Estimates of one process on one bus. ``state``: folder for learned values; without one nothing is learned; ``reader``
+    reads calibrations again at a reload."""
 
     def __init__(
         self, setup: Setup, bus: Bus, manager: ServiceManager | None = None, state: Path | None = None,
@@ -154,10 +141,13 @@ class Daemon:
         self._setup = setup
         self._bus = bus
         self._manager = manager or ServiceManager(environment={})
-        self._adaptation = Adaptation(setup.calibrations, Memory(state), _real_time, threaded=True) if state else None
+        self._adaptation = None
+        if state:
+            self._adaptation = Adaptation(setup.calibrations, Memory(state), lambda _: time.time_ns(), threaded=True)
         corners = tuple(setup.configuration.corners)
         self.pipeline: Pipeline = Pipeline(setup.parameters, corners, setup.layout, adaptation=self._adaptation)
         self._shared: SharedEstimates | None = None
+        #: ``ticks`` and ``missed``: periods run, and periods in which the loop did not wake.
         self.ticks: int = 0
         self.missed: int = 0
         self._active = sum(1 << CORNERS.index(name) for name in corners)
@@ -245,10 +235,8 @@ class Daemon:
     def run(self) -> None:
         """Tick until `stop`."""
         for name, calibration in self._setup.calibrations.items():
-            identity = {"corner": name, "actuator": calibration.actuator, "calibration": calibration_hash(calibration)}
-            log.info(
-                "corner %(corner)s: actuator %(actuator)s, calibration %(calibration)s", identity, extra={"fields": identity}
-            )
+            text = "corner %(corner)s: actuator %(actuator)s, calibration %(calibration)s"
+            note(text, corner=name, actuator=calibration.actuator, calibration=calibration_hash(calibration))
         now = time.monotonic_ns()
         self.pipeline.begin(now)
         pacer = Pacer(now)
@@ -416,11 +404,10 @@ class Daemon:
         waiting = {}
         for name, hashed in in_use.items():
             if name not in changed:
-                words = {"corner": name, "calibration": hashed}
-                log.info("corner %(corner)s: calibration %(calibration)s unchanged", words, extra={"fields": words})
+                note("corner %(corner)s: calibration %(calibration)s unchanged", corner=name, calibration=hashed)
                 continue
-            words = {"corner": name, "calibration": calibration_hash(changed[name])}
-            log.info("corner %(corner)s: calibration %(calibration)s read", words, extra={"fields": words})
+            read = calibration_hash(changed[name])
+            note("corner %(corner)s: calibration %(calibration)s read", corner=name, calibration=read)
             waiting[name] = changed[name], self._adaptation.read(name, changed[name]) if self._adaptation else None
         if request:
             request.read, request.fault = waiting, ""
@@ -440,16 +427,15 @@ class Daemon:
             self._adaptation.replace(name, calibration, learned, on_page)
             calibration = self._adaptation.in_use(name)
         self.pipeline.begin_anew(CORNERS.index(name), to_parameters(calibration))
-        words = {"corner": name, "calibration": calibration_hash(self._calibrations[name])}
-        log.info("corner %(corner)s: starts anew with calibration %(calibration)s", words, extra={"fields": words})
+        now = calibration_hash(self._calibrations[name])
+        note("corner %(corner)s: starts anew with calibration %(calibration)s", corner=name, calibration=now)
 
     def _ping(self) -> bool:
         """Ping the watchdog if a restart would not help; otherwise log the reason and return False.
 
         A restart would help if a corner gets no estimates, or if its state is not a number. If most ticks are missed, it helps
         where the loop itself has become slow, and costs more than it brings where others take the processor for some seconds:
-        so only if that lasts. It would not help against an interface that is down or gone.
-        """
+        so only if that lasts. It would not help against an interface that is down or gone."""
         met, missed = self.ticks - self._before[0], self.missed - self._before[1]
         silent = self._active & ~self._estimated
         amiss = [

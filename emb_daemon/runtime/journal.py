@@ -12,6 +12,11 @@ _PRIORITY = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERRO
 log: logging.Logger = logging.getLogger("emb_daemon")
 
 
+def note(text: str, **words: str) -> None:
+    """Log a line, whose words are fields of the journal, too."""
+    log.info(text, words, extra={"fields": words})
+
+
 class JournalHandler(logging.Handler):
     """The journal's native protocol: one datagram of FIELD=value lines. ``extra={"fields": {...}}`` adds EMB_* fields."""
 

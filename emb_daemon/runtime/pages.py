@@ -99,13 +99,8 @@ def socket_path(estimates: Path) -> Path:
 
 
 class PageListener:
-    """The daemon's side, in a thread.
-
-    Args:
-        path: of the socket.
-        ask: hands a request to the daemon; called in the thread.
-        end: called in the thread when a server that had requested something has gone.
-    """
+    """The daemon's side, in a thread, which hands a request to the daemon by ``ask``, and calls ``end`` when a server that had
+    requested something has gone."""
 
     def __init__(self, path: Path, ask: Callable[[Request], None], end: Callable[[], None]):
         """Raises Unavailable if the socket cannot be made."""

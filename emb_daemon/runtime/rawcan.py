@@ -93,8 +93,7 @@ def _from_kernel(raw, headers, control, count, stamped, offset_ns, earliest_ns, 
 
     The kernel's stamps are of CLOCK_REALTIME, which can step. ``offset_ns`` converts them to the monotonic clock, and the
     result is limited to between ``earliest_ns`` and now. It is rounded to whole microseconds, as candump logs them, so that a
-    log of the bus gives the same times.
-    """
+    log of the bus gives the same times."""
     drops = np.int64(-1)
     for index in range(count):
         if headers[index].length == 0:
@@ -132,18 +131,9 @@ def _to_kernel(frames, now_ns, raw):
 
 
 class RawCanSocket:
-    """Frames in batches over an already connected or bound socket; takes ownership of it.
-
-    Args:
-        stamped: frames carry the sender's time stamp (`socket_pair`) instead of the kernel's.
-        reopen: returns another such socket when the interface of this one is gone, or raises Unavailable.
-
-    Attributes:
-        dropped: frames for which this socket's receive buffer had no room.
-        unsent: frames that the kernel did not accept.
-        down: the interface is down or gone, as the last attempt to use it found.
-        full: the last drain took as much as it can; more may be waiting.
-    """
+    """Frames in batches over an already connected or bound socket; takes ownership of it. ``stamped``: frames carry the
+    sender's time stamp (`socket_pair`) instead of the kernel's; ``reopen``: returns another such socket when the interface of
+    this one is gone, or raises Unavailable."""
 
     def __init__(self, sock: socket.socket, stamped: bool = False, reopen: Callable[[], socket.socket] | None = None):
         self._socket, self._reopen = sock, reopen
@@ -156,10 +146,10 @@ class RawCanSocket:
         self._looked_ns = self._latest_ns = time.monotonic_ns()
         self._reopen_ns: int | None = None
         self._offset_ns = _clock_offset_ns()
-        self.dropped: int = 0
-        self.unsent: int = 0
-        self.down: bool = False
-        self.full: bool = False
+        self.dropped: int = 0  #: frames for which this socket's receive buffer had no room
+        self.unsent: int = 0  #: frames that the kernel did not accept
+        self.down: bool = False  #: the interface is down or gone, as the last attempt to use it found
+        self.full: bool = False  #: the last drain took as much as it can; more may be waiting
         # Compile now, not when the first frame is waiting.
         self._take(0, self._looked_ns)
         _to_kernel(self._frames[:0], 0, self._sent.raw)

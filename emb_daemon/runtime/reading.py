@@ -95,7 +95,6 @@ class Reader:
         return answered.changed
 
     def close(self) -> None:
-        """End the child."""
         if self._pipe is not None:
             self._pipe.close()
             self._pipe = None

@@ -58,12 +58,8 @@ class FreshnessFile:
             raise Unavailable(f"{self.path}: not readable: {error.strerror}") from None
 
     def begin_trip(self) -> Freshness:
-        """The stored values, with a trip counter that was never used before.
-
-        Raises:
-            Unavailable: it cannot be stored; messages sent under a counter that is used twice could be played back.
-            InputError: all trip counters are used up.
-        """
+        """The stored values, with a trip counter that was never used before. Raises Unavailable: it cannot be stored; messages
+        sent under a counter that is used twice could be played back. Raises InputError: all trip counters are used up."""
         kept = self.load()
         if kept.trip >= LAST_TRIP:
             raise InputError(f"{self.path}: all trip counters are used up; install new keys and remove this file")
@@ -92,17 +88,9 @@ class FreshnessFile:
 
 
 class Authentication:
-    """Both directions of one process.
-
-    Args:
-        received, sent: its links. Messages of a link without a key are refused, or sent without authentication.
-        keys: by the links' names.
-        kept: the process's own trip counter, and the counters received before.
-        file: where these are stored; None when logs are read.
-
-    Attributes:
-        keyless: links without a key.
-    """
+    """Both directions of one process, over its links; messages of a link without a key, all by the links' names, are refused,
+    or sent without authentication. ``kept``: the process's own trip counter, and the counters received before; ``file``: where
+    these are stored; None when logs are read."""
 
     def __init__(
         self,
@@ -112,7 +100,7 @@ class Authentication:
         kept: Freshness,
         file: FreshnessFile | None = None,
     ):
-        self.keyless: list[Link] = [link for link in (*received, *sent) if link.name not in keys]
+        self.keyless: list[Link] = [link for link in (*received, *sent) if link.name not in keys]  #: links without a key
         self._kept, self._file = kept, file
         self._verifier = Verifier(received, keys, kept.heard)
         self.verify: Callable[[np.ndarray], np.ndarray] = self._verifier.verify
@@ -179,12 +167,8 @@ class SecuredBus:
 
 
 def secure(bus: Bus, setup: Setup, state: Path | None) -> tuple[SecuredBus, set[str]]:
-    """The daemon's end of an authenticated bus, and the corners of which a key is missing.
-
-    Raises:
-        InputError: no state directory, or all trip counters used up.
-        Unavailable: the trip counter cannot be stored.
-    """
+    """The daemon's end of an authenticated bus, and the corners of which a key is missing. Raises InputError: no state
+    directory, or all trip counters used up. Raises Unavailable: the trip counter cannot be stored."""
     if state is None:
         raise InputError(f"{setup.path}: secoc: freshness must survive a restart; expected state_directory as well")
     file = FreshnessFile(state)

@@ -59,12 +59,8 @@ def _bytes_of(rows: np.ndarray) -> np.ndarray:
 
 
 class SharedEstimates:
-    """The loop's side.
-
-    Args:
-        path: the file, in a folder that is kept in memory, such as /run; the loop would have to wait for a disk.
-        pipeline: whose rows and parameters are shared.
-    """
+    """The loop's side, which shares a pipeline's rows and parameters. ``path``: the file, in a folder that is kept in memory,
+    such as /run; the loop would have to wait for a disk."""
 
     def __init__(self, path: Path, pipeline: "Pipeline"):
         """Raises OSError if the file cannot be written."""
@@ -105,22 +101,17 @@ class SharedEstimates:
         self._on_page[0] = on_page
 
     def close(self) -> None:
-        """Remove the file."""
         self.path.unlink(missing_ok=True)
 
 
 class EstimatesReader:
-    """The reader's side, which may start before the daemon and end after it.
-
-    Attributes:
-        connected: whether a daemon's file is being read.
-        trouble: why an existing file is not read; empty if it is read, or if there is none.
-        parameters: PARAMETERS array, shape (4,), as the daemon uses them; zeros before the first file.
-    """
+    """The reader's side, which may start before the daemon and end after it. ``connected``: whether a daemon's file is being
+    read."""
 
     def __init__(self, path: Path):
         self.path = path
-        self.trouble: str = ""
+        self.trouble: str = ""  #: why an existing file is not read; empty if it is read, or if there is none
+        #: PARAMETERS array, shape (4,), as the daemon uses them; zeros before the first file.
         self.parameters: np.ndarray = np.zeros(len(CORNERS), PARAMETERS)
         self._inode = self._taken = self._seen = 0
         self._memory: mmap.mmap | None = None
@@ -175,11 +166,8 @@ class EstimatesReader:
 
 
 class PresentEstimates:
-    """The newest estimate of each corner, for readers that need no others.
-
-    Attributes:
-        trouble: why there are none; empty if there are.
-    """
+    """The newest estimate of each corner, for readers that need no others. ``trouble``: why there are none; empty if there
+    are."""
 
     def __init__(self, path: Path):
         self._reader = EstimatesReader(path)

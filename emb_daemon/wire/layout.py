@@ -138,14 +138,9 @@ NO_DBC = (".arxml", ".kcd", ".sym")
 
 
 def load_database(path: Path, strict: bool = True) -> "Database":
-    """A cantools database: ARXML, KCD or SYM by ending, or a DBC, in UTF-8 or as Vector's tools write it (cp1252).
-
-    Args:
-        strict: whether signals of a message may neither overlap nor reach beyond it, as those of other people's files do.
-
-    Raises:
-        InputError: the file cannot be read or is no DBC.
-    """
+    """A cantools database: ARXML, KCD or SYM by ending, or a DBC, in UTF-8 or as Vector's tools write it (cp1252). ``strict``:
+    whether signals of a message may neither overlap nor reach beyond it, as those of other people's files do. Raises
+    InputError: the file cannot be read or is no DBC."""
     import cantools
 
     try:
@@ -180,11 +175,8 @@ def read_dbc(path: Path) -> str:
 
 
 def _convert(columns: np.ndarray, names: tuple[str, ...], message, expected) -> list[str]:
-    """Make the SIGNAL records of a message take and give ``expected``'s units instead of those of its own DBC.
-
-    Returns:
-        Faults: units that are missing, unknown or of another quantity.
-    """
+    """Make the SIGNAL records of a message take and give ``expected``'s units instead of those of its own DBC; returns faults:
+    units that are missing, unknown or of another quantity."""
     faults = []
     for column, name in zip(columns, names, strict=True):
         unit, target = ((found.get_signal_by_name(name).unit or "").strip() for found in (message, expected))
@@ -234,11 +226,8 @@ def _read_message(database: "Database", shipped: "Database", name: str, names: t
 def load_layout(path: Path | None = None, corners: tuple[str, ...] = CORNERS) -> np.ndarray:
     """The LAYOUT (shape (1,)) of the messages that concern ``corners``, all others being foreign.
 
-    Signals of another DBC are converted from its units into those of the shipped one.
-
-    Raises:
-        InputErrors: the DBC lacks messages, signals, units or cycle times, or contradicts the contract; every fault is listed.
-    """
+    Signals of another DBC are converted from its units into those of the shipped one. Raises InputErrors: the DBC lacks
+    messages, signals, units or cycle times, or contradicts the contract; every fault is listed."""
     # cantools, and python-can with it, take a third of the daemon's start.
     if path is None and (known := library.layout_of(resource("dbc/emb.dbc"))):
         return _restrict(np.frombuffer(known, LAYOUT).copy(), corners)

@@ -61,8 +61,7 @@ def _in_sequence(counter, time_ns, reception, cycle_ns):
     another sender. So does a frame that comes half a cycle before its time: a bus delays frames, which may then come in a
     burst, but never makes them early. Two frames out of sequence that follow each other after half a cycle or more, with no
     frame in sequence between them, come from a sender that has restarted. After a silence of one turn of the counter, the
-    counter may be the same as before.
-    """
+    counter may be the same as before."""
     if reception.sequence < 0:
         return _start_schedule(counter, time_ns, reception, cycle_ns)
     step = (counter - reception.sequence) % COUNTER_MODULO
@@ -91,8 +90,7 @@ def _start_schedule(counter, time_ns, reception, cycle_ns):
     """Begin the sender's schedule with this frame; always True.
 
     A single frame does not determine a schedule, because it may be the first of a delayed burst. The schedule therefore begins
-    one turn of the counter earlier, which allows frames to come earlier by that much, until the first window has shown it.
-    """
+    one turn of the counter earlier, which allows frames to come earlier by that much, until the first window has shown it."""
     reception.sequence = counter
     reception.sequence_ns = time_ns
     reception.due_ns = time_ns - COUNTER_MODULO * cycle_ns
@@ -163,8 +161,7 @@ def _verdict(frame, slot, reception, layout):
 def receive(frame: Record, receptions: Records, layout: Record) -> tuple[Integer, int]:
     """Check one FRAME record and, if it is accepted, store its signals.
 
-    Returns (slot, verdict); the slot is negative for a frame that the daemon does not receive.
-    """
+    Returns (slot, verdict); the slot is negative for a frame that the daemon does not receive."""
     if frame.flags & (EXTENDED | REMOTE | ERROR | FD) or frame.can_id > 2047:
         return -1, IGNORED
     slot = np.int64(layout.slot[frame.can_id])

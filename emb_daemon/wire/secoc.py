@@ -68,8 +68,7 @@ class Link(NamedTuple):
     """The messages that one sender authenticates for one receiver, under a key of their own.
 
     ``name`` is the name of the authentication message and of the key; ``corner`` is empty for the vehicle; ``sets`` are the
-    CAN ids of the messages of each set.
-    """
+    CAN ids of the messages of each set."""
 
     name: str
     corner: str
@@ -180,19 +179,12 @@ def _authenticator(link, number, first, second, trip, reset, message):
 
 
 class Signer:
-    """Puts authentication frames among the frames that a process sends.
-
-    Args:
-        links: those of which the process is the sender; messages of a link without a key are sent without authentication.
-        keys: of 16 bytes, by the links' names.
-        trip: trip counter of the process, one more than at its last start.
-
-    Attributes:
-        links: their LINK records, shape (links,).
-    """
+    """Puts authentication frames among the frames that a process sends on ``links``; messages of one without a key are sent
+    without authentication. ``keys`` of 16 bytes by the links' names; ``trip`` counter of the process, one more than at its
+    last start."""
 
     def __init__(self, links: Iterable[Link], keys: Mapping[str, bytes], trip: int):
-        self.links: np.ndarray
+        self.links: np.ndarray  #: their LINK records, shape (links,)
         self.links, self._places = _new_links(links, keys)
         self.links["trip"] = trip
         self._frames = np.zeros(64, FRAME)
@@ -256,26 +248,19 @@ def _append_authentication(link, number, time_ns, first, second, signed, count):
 
 
 class Verifier:
-    """Passes only authentic frames on, before `receive` looks at their counters and times.
+    """Passes only authentic frames of ``links`` on, before `receive` looks at their counters and times; every frame of one
+    without a key is refused. ``keys`` of 16 bytes and ``last``, (trip, reset) received, after which freshness values are
+    accepted, by the links' names.
 
     The verifier holds a frame until the authentication of its set arrives. It then passes the frame on with the arrival time
     of the authentication, because only from then on the frame can be used. A frame without authentication in time, and a frame
     whose set was completed by another frame of the same Counter, are passed on marked UNAUTHENTIC; `receive` refuses them. The
-    result depends only on the frames and their order, so a recorded log gives the same result as the bus.
-
-    Args:
-        links: those of which the process is the receiver; every frame of a link without a key is refused.
-        keys: of 16 bytes, by the links' names.
-        last: (trip, reset) by the links' names: the last ones received, so that only later freshness values are accepted.
-
-    Attributes:
-        links: their LINK records, shape (links,).
-    """
+    result depends only on the frames and their order, so a recorded log gives the same result as the bus."""
 
     def __init__(self, links: Iterable[Link], keys: Mapping[str, bytes], last: Mapping[str, tuple[int, int]]):
         links = list(links)
         self._names = [link.name for link in links]
-        self.links: np.ndarray
+        self.links: np.ndarray  #: their LINK records, shape (links,)
         self.links, self._places = _new_links(links, keys)
         for name, record in zip(self._names, self.links, strict=True):
             record["trip"], record["reset"] = last.get(name, (0, 0))

@@ -114,8 +114,7 @@ def version_of(calibrations: Mapping[str, Calibration], calibrate: bool) -> str:
 def make_a2l(calibrations: Mapping[str, Calibration], connection: Connection | None = None, calibrate: bool = False) -> bytes:
     """The file for a daemon that estimates the corners of ``calibrations``: ASCII, as ASAM MCD-2 MC requires.
 
-    With ``connection`` it states how the server is reached; with ``calibrate`` it contains the numbers that may be written.
-    """
+    With ``connection`` it states how the server is reached; with ``calibrate`` it contains the numbers that may be written."""
     methods, blocks = _Methods(), []
     for name, calibration in calibrations.items():
         corner, numbers = CORNERS.index(name), places(calibration)

@@ -36,14 +36,8 @@ def _place(index: int) -> tuple[bool, np.dtype, int]:
 
 
 class Image:
-    """Bytes by address.
-
-    Args:
-        version: the text at VERSION_ADDRESS.
-
-    Attributes:
-        parameters: the PARAMETERS array, shape (4,), that can be read.
-    """
+    """Bytes by address. ``version``: the text at VERSION_ADDRESS. ``parameters``: the PARAMETERS array, shape (4,), that can
+    be read."""
 
     def __init__(self, version: bytes):
         self.parameters: np.ndarray = np.zeros(len(CORNERS), PARAMETERS)

@@ -37,11 +37,8 @@ _HEADER = struct.Struct("<HH")
 class Udp:
     """XCP on UDP (ASAM MCD-1 XCP, transport layer Ethernet): packets with length and counter, several to a datagram.
 
-    The sender of the last CONNECT is the master; packets of others are ignored.
-
-    Attributes:
-        gone: the master's machine reported that its port is closed.
-    """
+    The sender of the last CONNECT is the master; packets of others are ignored. ``gone``: the master's machine reported that
+    its port is closed."""
 
     layer = ON_UDP
 
@@ -111,12 +108,7 @@ class Udp:
 
 
 class Can:
-    """XCP on CAN: a packet is a frame of eight bytes.
-
-    Args:
-        bus: that receives ``request_id``.
-        request_id, response_id: 11-bit CAN ids.
-    """
+    """XCP on CAN: a packet is a frame of eight bytes. ``bus`` receives ``request_id``; ids have 11 bits."""
 
     layer = ON_CAN
     #: On a bus the end of a master cannot be detected.
@@ -147,15 +139,10 @@ class Can:
 
 
 class Measurement:
-    """A slave on a transport, fed by a daemon.
+    """A slave on a transport, fed by a daemon, whose file of ``estimates`` (`runtime.shared`) need not exist yet.
 
-    Args:
-        estimates: the daemon's file (`runtime.shared`), which need not exist yet.
-        transport: `Udp` or `Can`.
-        version: the text that identifies the memory to which the A2L file belongs.
-        name, file: of the A2L file, without ending, and its content.
-        calibrations: of the files, by corner, if they may be written.
-    """
+    ``version``: the text that identifies the memory to which the A2L file belongs; ``name``, ``file``: of that, without
+    ending, and its content; ``calibrations``: of the files, by corner, if they may be written."""
 
     def __init__(
         self, estimates: Path, transport: Udp | Can, version: bytes, name: bytes, file: bytes,

@@ -35,17 +35,8 @@ def digest(calibrations: Mapping[str, Calibration]) -> str:
 
 
 class Segment:
-    """The two pages.
-
-    Args:
-        calibrations: of the files, by corner.
-        ask: sends a page to the daemon.
-        on_page: whether the daemon estimates with numbers that differ from the files.
-
-    Attributes:
-        shown: the page that the tool reads and writes.
-        size: in bytes.
-    """
+    """The two pages, of the calibrations of the files. ``ask`` sends a page to the daemon; ``on_page``: whether that estimates
+    with numbers that differ from the files."""
 
     def __init__(self, calibrations: Mapping[str, Calibration], ask: Callable[[Page], Answer], on_page: Callable[[], bool]):
         self._numbers, self._ask, self._on_page = numbers(calibrations), ask, on_page
@@ -54,8 +45,8 @@ class Segment:
         self._files = struct.pack(f"<{len(values)}d", *values)
         self._working = self._taken = self._files
         self._used = FILES
-        self.shown: int = WORKING
-        self.size: int = len(self._files)
+        self.shown: int = WORKING  #: the page that the tool reads and writes
+        self.size: int = len(self._files)  #: in bytes
 
     def read(self, address: int, size: int) -> bytes | None:
         """``size`` bytes of the shown page; None if not all of them can be read."""

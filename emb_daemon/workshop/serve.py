@@ -99,15 +99,9 @@ def data_of(
 
 
 class Diagnostics:
-    """Answers a tester on a bus.
-
-    Args:
-        bus: that receives the broadcasts and ``request_id`` (`ids`).
-        configuration: the daemon's.
-        state: the daemon's state directory, where the trouble codes are stored too.
-        request_id, response_id: 11-bit CAN ids.
-        estimates: the daemon's file (`runtime.shared`), which need not exist.
-    """
+    """Answers a tester on a bus that receives the broadcasts and ``request_id`` (`ids`), by 11-bit ids. ``configuration`` and
+    ``state`` are the daemon's; the trouble codes are stored in ``state`` too. Its file of ``estimates`` (`runtime.shared`)
+    need not exist."""
 
     def __init__(self, bus: Bus, configuration: Path, state: Path, request_id: int, response_id: int, estimates: Path):
         """Raises InputErrors for a faulty configuration, OSError for a folder that cannot be written, ImportError without

@@ -101,18 +101,13 @@ class _Stored(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class TroubleMemory:
-    """All codes, stored in a folder.
-
-    Attributes:
-        entries: by code.
-        warning: why an existing file is not used; empty if it is used, or if there was none.
-    """
+    """All codes, stored in a folder."""
 
     def __init__(self, folder: Path):
         """Read the stored codes, and begin an operation cycle. Raises OSError if the folder cannot be written."""
         self.path: Path = folder / FILE
-        self.warning: str = ""
-        self.entries: dict[int, Entry] = {code: Entry() for code in _INDEX}
+        self.warning: str = ""  #: why an existing file is not used; empty if it is used, or if there was none
+        self.entries: dict[int, Entry] = {code: Entry() for code in _INDEX}  #: by code
         self._consecutive = [0] * CODES
         self._dirty_s: float | None = None
         try:

@@ -32,12 +32,8 @@ class _Refused(Exception):
 
 
 class Server:
-    """Answers the requests of one tester.
-
-    Args:
-        memory: the trouble codes.
-        data: functions that read each two-byte data identifier; F186 is the server's own.
-    """
+    """Answers the requests of one tester. ``data``: functions that read each two-byte data identifier; F186 is the server's
+    own."""
 
     def __init__(self, memory: TroubleMemory, data: Mapping[int, Callable[[], bytes]]):
         self._memory, self._data = memory, data
@@ -47,7 +43,7 @@ class Server:
             CLEAR: self._clear,
             READ_CODES: self._read_codes,
             READ_DATA: self._read_data,
-            TESTER_PRESENT: self._tester_present,
+            TESTER_PRESENT: lambda body: bytes([_subfunction(body, {0: 0})]),
         }
 
     def answer(self, request: bytes, now_s: float) -> bytes:
@@ -76,9 +72,6 @@ class Server:
         self._session = session
         return bytes([session]) + _P2_MS.to_bytes(2, "big") + _P2_EXTENDED_10MS.to_bytes(2, "big")
 
-    def _tester_present(self, body: bytes) -> bytes:
-        return bytes([_subfunction(body, {0: 0})])
-
     def _clear(self, body: bytes) -> bytes:
         if len(body) != 3:
             raise _Refused(_WRONG_LENGTH)
@@ -95,7 +88,11 @@ class Server:
             if code not in entries or record not in _RECORDS:
                 raise _Refused(_OUT_OF_RANGE)
             entry = entries[code]
-            return bytes([kind]) + body[1:4] + bytes([entry.status]) + (_snapshot(entry) if kind == 0x04 else _extended(entry))
+            if kind == 0x04:
+                content = _snapshot(entry)
+            else:
+                content = bytes([_OCCURRENCES_AND_AGEING, entry.occurrences, entry.aged]) if entry.occurrences else b""
+            return bytes([kind]) + body[1:4] + bytes([entry.status]) + content
         found = [
             code.to_bytes(3, "big") + bytes([entry.status])
             for code, entry in entries.items()
@@ -137,7 +134,3 @@ def _snapshot(entry: Entry) -> bytes:
     if entry.frame is None:
         return b""
     return bytes([_RECORDS[0], 1]) + FREEZE_FRAME.to_bytes(2, "big") + entry.frame.encode()
-
-
-def _extended(entry: Entry) -> bytes:
-    return bytes([_OCCURRENCES_AND_AGEING, entry.occurrences, entry.aged]) if entry.occurrences else b""

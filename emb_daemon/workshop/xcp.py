@@ -89,19 +89,8 @@ class _List:
 
 
 class Slave:
-    """One session, begun anew by each CONNECT.
-
-    Args:
-        memory: the memory that can be read.
-        transport: ON_CAN or ON_UDP.
-        clock: monotonic time now, ns.
-        name: of the A2L file, without its ending.
-        file: the A2L file.
-        segment: the calibration, where it may be written.
-
-    Attributes:
-        connected: whether there is a session.
-    """
+    """One session, begun anew by each CONNECT. ``clock``: monotonic time now, ns; ``name`` of the A2L ``file``, without its
+    ending; ``segment``: the calibration, where it may be written."""
 
     def __init__(
         self, memory: Image, transport: Transport, clock: Callable[[], int], name: bytes, file: bytes,
@@ -109,7 +98,7 @@ class Slave:
     ):  # fmt: skip
         self._memory, self._transport, self._clock, self._segment = memory, transport, clock, segment
         self._texts = {0: name, 1: name, 4: file}
-        self.connected: bool = False
+        self.connected: bool = False  #: whether there is a session
         self._reset()
         commands = READING if segment is None else READING | CALIBRATING
         self._commands = {command.code: command for command in commands.values()}
@@ -123,7 +112,6 @@ class Slave:
 
     @property
     def acquiring(self) -> bool:
-        """Whether a list is running."""
         return any(chosen.running for chosen in self._lists)
 
     def answer(self, packet: bytes) -> bytes:
@@ -142,7 +130,6 @@ class Slave:
             return bytes([_ERROR, *refusal.args])
 
     def end(self) -> None:
-        """End the session."""
         self.connected = False
         self._reset()
 
@@ -157,10 +144,6 @@ class Slave:
 
     def _synch(self) -> None:
         raise Refusal(SYNCH)
-
-    def _communication_mode(self) -> bytes:
-        """No block mode, no interleaving."""
-        return bytes(7)
 
     def _identify(self, kind: int) -> bytes:
         """0 and 1: name; 4: the file itself; for all others a text of length 0."""
@@ -187,9 +170,6 @@ class Slave:
         if self._segment and not extension and (content := self._segment.read(address, count)) is not None:
             return content
         return self._memory.read(extension, address, count)
-
-    def _download(self, count: int) -> None:
-        self._write(count, 2)
 
     def _short_download(self, count: int, extension: int, address: int) -> None:
         self._address = extension, address
@@ -257,19 +237,12 @@ class Slave:
         if from_page == FILES:
             self._segment.fill()
 
-    def _page_processor(self) -> bytes:
-        """One segment, none of whose pages can be frozen."""
-        return bytes([1, 0])
-
     def _short_upload(self, count: int, extension: int, address: int) -> bytes:
         self._address = extension, address
         return self._upload(count)
 
     def _now(self) -> bytes:
         return struct.pack("<xHI", 0, self._ticks(self._clock()) & 0xFFFFFFFF)
-
-    def _processor(self) -> bytes:
-        return struct.pack("<BHHBB", _DAQ_PROPERTIES, LISTS, len(CORNERS), 0, 0)
 
     def _resolution(self) -> bytes:
         largest = min(self._transport.max_dto - 1, 0xFF)
@@ -431,7 +404,8 @@ READING = _table([
     ("DISCONNECT", 0xFE, "", Slave.end),
     ("GET_STATUS", 0xFD, "", Slave._status),
     ("SYNCH", 0xFC, "", Slave._synch),
-    ("GET_COMM_MODE_INFO", 0xFB, "", Slave._communication_mode),
+    # No block mode, no interleaving.
+    ("GET_COMM_MODE_INFO", 0xFB, "", lambda slave: bytes(7)),
     ("GET_ID", 0xFA, "B", Slave._identify),
     ("SET_MTA", 0xF6, "2xBI", Slave._set_address),
     ("UPLOAD", 0xF5, "B", Slave._upload),
@@ -443,7 +417,7 @@ READING = _table([
     ("START_STOP_DAQ_LIST", 0xDE, "BH", Slave._start_stop_list),
     ("START_STOP_SYNCH", 0xDD, "B", Slave._start_stop),
     ("GET_DAQ_CLOCK", 0xDC, "", Slave._now),
-    ("GET_DAQ_PROCESSOR_INFO", 0xDA, "", Slave._processor),
+    ("GET_DAQ_PROCESSOR_INFO", 0xDA, "", lambda slave: struct.pack("<BHHBB", _DAQ_PROPERTIES, LISTS, len(CORNERS), 0, 0)),
     ("GET_DAQ_RESOLUTION_INFO", 0xD9, "", Slave._resolution),
     ("GET_DAQ_EVENT_INFO", 0xD7, "xH", Slave._event_information),
     ("FREE_DAQ", 0xD6, "", Slave._free),
@@ -452,11 +426,12 @@ READING = _table([
     ("ALLOC_ODT_ENTRY", 0xD3, "xHBB", Slave._allocate_entries),
 ])  # fmt: skip
 CALIBRATING = _table([
-    ("DOWNLOAD", 0xF0, "B", Slave._download),
+    ("DOWNLOAD", 0xF0, "B", lambda slave, count: slave._write(count, 2)),
     ("SHORT_DOWNLOAD", 0xED, "BxBI", Slave._short_download),
     ("SET_CAL_PAGE", 0xEB, "BBB", Slave._set_page),
     ("GET_CAL_PAGE", 0xEA, "BB", Slave._page),
-    ("GET_PAG_PROCESSOR_INFO", 0xE9, "", Slave._page_processor),
+    # One segment, none of whose pages can be frozen.
+    ("GET_PAG_PROCESSOR_INFO", 0xE9, "", lambda slave: bytes([1, 0])),
     ("GET_SEGMENT_INFO", 0xE8, "BBBB", Slave._segment_information),
     ("GET_PAGE_INFO", 0xE7, "xBB", Slave._page_information),
     ("COPY_CAL_PAGE", 0xE4, "BBBB", Slave._copy_page),

@@ -5,12 +5,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """What a step found.
-
-    Attributes:
-        values, sigmas: numbers and their standard deviations by the calibration's keys.
-        notes: sentences for the report.
-    """
+    """What a step found: numbers and their standard deviations by the calibration's keys, and sentences for the report."""
 
     values: dict[str, float] = field(default_factory=dict)
     sigmas: dict[str, float] = field(default_factory=dict)

@@ -34,23 +34,14 @@ _FAST = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class AttributionStep(Step):
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        calibration: with what was accepted.
-        diagnosis: the search; None where nothing clamps fast or the logs are too short for one.
-        hot: errors of the stiffness path on the logs that heat the pads.
-        hot_current: current that is unexplained there.
-        fastest_rad_per_s: speed of the motor in the hardest clamp of those logs.
-        undecided: relative force by which alternatives to what was found differ from it, by the key of ``noise`` that must
-            cover it.
-    """
-
-    calibration: Calibration
-    diagnosis: Diagnosis | None = None
-    hot: tuple[Errors, ...] = ()
-    hot_current: tuple[Unexplained, ...] = ()
-    fastest_rad_per_s: float = 0.0
+    calibration: Calibration  #: with what was accepted
+    diagnosis: Diagnosis | None = None  #: the search; None where nothing clamps fast or the logs are too short for one
+    hot: tuple[Errors, ...] = ()  #: errors of the stiffness path on the logs that heat the pads
+    hot_current: tuple[Unexplained, ...] = ()  #: current that is unexplained there
+    fastest_rad_per_s: float = 0.0  #: speed of the motor in the hardest clamp of those logs
+    #: Relative force by which alternatives to what was found differ from it, by the key of ``noise`` that must cover it.
     undecided: Mapping[str, float] = field(default_factory=dict)
 
     def without(self, fold: Fold) -> Calibration:

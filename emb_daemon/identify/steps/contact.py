@@ -21,11 +21,7 @@ def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> 
     """Clearance as the mean of all logs, with the standard deviation with which the next power-on will find it.
 
     A log that begins in contact shows no clearance; if all do, it is the datasheet's, with half of it as standard deviation.
-
-    Args:
-        count_rad: the resolver's smallest step.
-        nominal_rad: the datasheet's clearance.
-    """
+    ``count_rad``: the resolver's smallest step; ``nominal_rad``: the datasheet's clearance."""
     curves = stiffness.fit.curves
     found = np.concatenate([curve.clearances_rad for curve in curves])
     errors = np.concatenate([curve.clearance_sigmas_rad for curve in curves])
@@ -49,8 +45,7 @@ def identify(stiffness: StiffnessStep, count_rad: float, nominal_rad: float) -> 
 def _walk(stiffness: StiffnessStep) -> float:
     """Random walk of the contact angle, rad per root of a second, from estimates ten seconds apart in the fitted logs.
 
-    It contains the scatter of the estimates, and is therefore rather too large.
-    """
+    It contains the scatter of the estimates, and is therefore rather too large."""
     squares, seconds = 0.0, 0.0
     fit = stiffness.fit
     for pads, curve in zip(stiffness.pads, fit.curves, strict=True):

@@ -20,11 +20,8 @@ _POINTS = Style("#1d2430", mode="markers")
 
 @dataclass(frozen=True)
 class CoolingLaw:
-    """b_d = ``rest`` + ``per_speed`` omega in 1/s, and the logs' rates from which it is fitted, shape (n,).
-
-    Attributes:
-        biot: Biot number of the disc at each rate.
-    """
+    """b_d = ``rest`` + ``per_speed`` omega in 1/s, and the logs' rates from which it is fitted, shape (n,). ``biot``: Biot
+    number of the disc at each rate."""
 
     rest: float
     per_speed: float
@@ -67,7 +64,6 @@ def _rate(r: Recording) -> tuple[float, float, float] | None:
 
 
 def figure(section: Section, law: CoolingLaw) -> None:
-    """The law in the report."""
     order = np.argsort(law.speed_rad_per_s)
     speed = law.speed_rad_per_s[order]
     rates = [

@@ -57,21 +57,14 @@ def _rows(r: Recording, parameters: np.void) -> np.ndarray:
 
 class FrictionFit:
     """Friction coefficient as a polynomial of force, speed and temperature, each normalised by its mean and spread: linear,
-    and quadratic in temperature if that lowers the error on pieces of data left out in turn.
-
-    Args:
-        rows: of steady braking, (force N, speed rad/s, temperature degC, coefficient), shape (4, n). They are weighted by
-            force, because the torque sensor's noise is constant.
-
-    Attributes:
-        temperature_C, measured, model: of each row.
-        sigma: standard deviation of the coefficient at a typical row, pieces of data left out in turn.
-        rms: of measured minus model, weighted by force.
-    """
+    and quadratic in temperature if that lowers the error on pieces of data left out in turn. ``rows``: of steady braking,
+    (force N, speed rad/s, temperature degC, coefficient), shape (4, n). They are weighted by force, because the torque
+    sensor's noise is constant."""
 
     def __init__(self, rows: np.ndarray):
         self._columns = rows[:3]
         force = rows[0]
+        #: ``temperature_C``, ``measured`` and ``model``: of each row.
         self.temperature_C: np.ndarray = rows[2]
         self.measured: np.ndarray = rows[3]
         self._centre = self._columns.mean(axis=1)
@@ -85,8 +78,9 @@ class FrictionFit:
         design = self._design(self._columns, self._bent)
         self.model: np.ndarray = design @ self._terms
         covariance = left_out_covariance(left_out[self._bent])
+        #: Standard deviation of the coefficient at a typical row, pieces of data left out in turn.
         self.sigma: float = float(np.sqrt(np.mean(np.einsum("ti,ij,tj->t", design, covariance, design))))
-        self.rms: float = rmse(self.model - self.measured, force**2)
+        self.rms: float = rmse(self.model - self.measured, force**2)  #: of measured minus model, weighted by force
 
     def _design(self, columns, bent):
         u = [(column - c) / w for column, c, w in zip(columns, self._centre, self._width, strict=True)]
@@ -143,15 +137,9 @@ class FrictionFit:
 def fit_friction(recordings: list[Recording], parameters: np.void) -> FrictionFit:
     """Friction coefficient from brake torque, clamp force and the modelled surface temperature (mean of both pads).
 
-    A smooth model is tabulated, because a table filled from data would have empty corners.
-
-    Args:
-        recordings: those with `Recording.dense`.
-        parameters: PARAMETERS, pads and disc already identified.
-
-    Raises:
-        InputError: too little steady braking.
-    """
+    A smooth model is tabulated, because a table filled from data would have empty corners. ``recordings``: those with
+    `Recording.dense`; ``parameters``: PARAMETERS, pads and disc already identified. Raises InputError: too little steady
+    braking."""
     rows = np.concatenate([_rows(r, parameters) for r in recordings], axis=1)
     if rows.shape[1] < _LEAST_ROWS:
         names = ", ".join(r.name for r in recordings)

@@ -73,8 +73,7 @@ def nominal_thermal(sheet: Datasheet) -> Thermal:
 
     Conductances of pads on a disc: Limpert, Brake Design and Safety, 3rd ed., ch. 3; a released pad sits some 0.1 mm of
     air away (k / gap = 260 W/(m^2 K)). Free convection of a disc is 5 to 15 W/(m^2 K). Organic pads take some five per cent
-    of the heat each.
-    """
+    of the heat each."""
     pad, disc = sheet.pad, sheet.disc
     return Thermal(
         pad=Pad(
@@ -116,8 +115,7 @@ def fit_heat(recordings: list[Recording], start: Calibration) -> Step:
 
     Residuals are strongly correlated and the equations approximate, so that a whole log counts as one episode, or, with fewer
     than four logs, one sixth of each. Logs of the disc alone fit nothing inside the pads: the pads' parameters would make up
-    for errors of the disc's model, and be wrong elsewhere.
-    """
+    for errors of the disc's model, and be wrong elsewhere."""
     told = [key for key in UNKNOWNS if key in _OF_DISC or any(r.has_pads for r in recordings)]
     pieces = 1 if len(recordings) >= _FEW_LOGS else _PIECES
     blocks = [_block(r, start, pieces, told) for r in recordings]

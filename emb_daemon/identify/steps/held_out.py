@@ -18,20 +18,13 @@ from emb_daemon.offline.run import held, run_step
 @dataclass(frozen=True, kw_only=True)
 class Fold(Step):
     """What is known of one thickness without its random logs: dynamics and torque path of the other thicknesses, curve and
-    contact of its own slow log.
-
-    Attributes:
-        held_out: its random logs.
-        torque: fit of the torque path to the other thicknesses' logs.
-        errors: of the stiffness path on each of them.
-        unexplained: of the torque path on each of them.
-    """
+    contact of its own slow log."""
 
     pads: Pads
-    held_out: tuple[Log, ...]
-    torque: TorqueFit = field(repr=False)
-    errors: list[Errors] = field(repr=False)
-    unexplained: list[Unexplained] = field(repr=False)
+    held_out: tuple[Log, ...]  #: its random logs
+    torque: TorqueFit = field(repr=False)  #: fit of the torque path to the other thicknesses' logs
+    errors: list[Errors] = field(repr=False)  #: of the stiffness path on each of them
+    unexplained: list[Unexplained] = field(repr=False)  #: of the torque path on each of them
 
     def under(self, calibration: Calibration) -> "Fold":
         """The same with the errors of another calibration, which has these pads."""

@@ -49,10 +49,8 @@ def identify(
 ) -> Step:
     """Noise levels from the folds, or where there are none from the second halves of the random logs, or from slow logs.
 
-    Args:
-        interpolation: relative force error that a curve between two measured pad thicknesses adds.
-        found: the search, once it is done; what it leaves of hot pads is used where it is larger than that of cold pads.
-    """
+    ``interpolation``: relative force error that a curve between two measured pad thicknesses adds; ``found``: the search, once
+    it is done, of which what it leaves of hot pads is used where that is larger than what is left of cold pads."""
     known = stiffness.fit.calibration
     found = found or AttributionStep(calibration=known)
     gear_gain, rated_N = known.motor.gear_gain_m_per_rad, campaign.datasheet.actuator.rated_clamp_force_N
@@ -191,13 +189,11 @@ def _innovation_cost(residual, variance, decay, difference):
 
 
 def current_noise(residuals: list[np.ndarray], difference_A: float) -> tuple[float, float]:
-    """First-order coloured noise of the current by maximum likelihood: (standard deviation in A, correlation time in s).
+    """First-order coloured noise of the unexplained current, in gap-free stretches, by maximum likelihood: (standard deviation
+    in A, correlation time in s).
 
-    Args:
-        residuals: unexplained current, gap-free stretches.
-        difference_A: standard deviation of the further part that the speed's noise causes through inertia times a difference
-            of two speeds; each speed's noise enters twice with opposite signs, so that this part is not white.
-    """
+    ``difference_A``: standard deviation of the further part that the speed's noise causes through inertia times a difference
+    of two speeds; each speed's noise enters twice with opposite signs, so that this part is not white."""
     from scipy.optimize import minimize
 
     total = float(np.mean(np.concatenate(residuals) ** 2))
@@ -299,7 +295,6 @@ def torque_levels(held_out: list[Unexplained], gear_gain: float, speed_sigma: fl
 
 
 def section(page: Page, calibration: Calibration) -> None:
-    """Noise levels in the report."""
     noise, contact = calibration.noise, calibration.contact
     part = page.section(
         "Noise levels",

@@ -39,28 +39,19 @@ _POINTS = Style("#1d2430", mode="markers")
 
 @dataclass(frozen=True)
 class SofteningFit:
-    """Softening, per burst where shapes are (bursts,).
+    """Softening, per burst where shapes are (bursts,)."""
 
-    Attributes:
-        values: by the calibration's keys; fitted to every other burst from the first.
-        sigmas: likewise: from bursts left out in turn, and from the residual.
-        factor, factor_sigma: measured stiffness factor.
-        modelled: factor by the first-order history.
-        shift_rad: contact shift, if that is fitted too.
-        ours_N: RMSE of force over the bursts that were not fitted.
-        uncorrected_N: the same with cold stiffness throughout.
-    """
-
-    values: dict[str, float]
-    sigmas: dict[str, float]
+    values: dict[str, float]  #: by the calibration's keys; fitted to every other burst from the first
+    sigmas: dict[str, float]  #: likewise: from bursts left out in turn, and from the residual
     time_s: np.ndarray
     rise_K: np.ndarray
+    #: ``factor`` and ``factor_sigma``: measured stiffness factor.
     factor: np.ndarray
     factor_sigma: np.ndarray
-    modelled: np.ndarray
-    shift_rad: np.ndarray
-    ours_N: float
-    uncorrected_N: float
+    modelled: np.ndarray  #: factor by the first-order history
+    shift_rad: np.ndarray  #: contact shift, if that is fitted too
+    ours_N: float  #: RMSE of force over the bursts that were not fitted
+    uncorrected_N: float  #: the same with cold stiffness throughout
 
     def figures(self) -> dict[str, float]:
         """RMSE of force on bursts that were not fitted."""
@@ -77,23 +68,19 @@ class SofteningFit:
 
 @dataclass(frozen=True)
 class Bursts:
-    """Bursts of clamps, and the stiffness path of cold pads over them.
-
-    Attributes:
-        rows: of the log, one slice per burst.
-        parameters: PARAMETERS of each burst, shape (1,): one curve, refined on the cold burst, and one contact angle.
-        time_s, rise_K: middle of each, and rise of the pads' mean temperature over the first burst's, shape (bursts,).
-        reference_C: mean temperature of the pads at the first burst.
-        grid_s, grid_rise_K: the rise over the whole log.
-    """
+    """Bursts of clamps, and the stiffness path of cold pads over them."""
 
     log: Log
-    rows: list[slice]
+    rows: list[slice]  #: of the log, one slice per burst
     contact: float
+    #: PARAMETERS of each burst, shape (1,): one curve, refined on the cold burst, and one contact angle.
     parameters: list[np.ndarray]
+    #: ``time_s`` and ``rise_K``: middle of each, and rise of the pads' mean temperature over the first burst's, shape
+    #: (bursts,).
     time_s: np.ndarray
     rise_K: np.ndarray
-    reference_C: float
+    reference_C: float  #: mean temperature of the pads at the first burst
+    #: ``grid_s`` and ``grid_rise_K``: the rise over the whole log.
     grid_s: np.ndarray
     grid_rise_K: np.ndarray
 
@@ -237,19 +224,13 @@ class _Law:
 
 
 def fit_softening(log: Log, heat: Recording, calibration: Calibration) -> SofteningFit:
-    """Softening from a log with bursts of clamps on pads that heat up and cool down.
+    """Softening from a log with bursts of clamps on pads that heat up and cool down; ``heat`` is of the same log. Raises
+    InputError: too few bursts, or no heat between them.
 
     The curve's scale is taken from the first, cold burst; then each burst has a stiffness factor, and these are explained by
-    the mean pad temperature of the heat model and its history. Bursts 0, 2, 4, ... are fitted, the others validate.
-
-    Args:
-        heat: the same log.
-        calibration: pads and disc already identified, relaxation, effects and clearance; the curve is refined on the cold
-            burst.
-
-    Raises:
-        InputError: too few bursts, or no heat between them.
-    """
+    the mean pad temperature of the heat model and its history. Bursts 0, 2, 4, ... are fitted, the others validate. The
+    calibration has pads and disc already identified, relaxation, effects and clearance; the curve is refined on the cold
+    burst."""
     bursts = cold_bursts(log, heat, calibration)
     factor, factor_sigma, shift = _factors(bursts)
     law = _Law(bursts, 1.0 - factor)
@@ -279,7 +260,6 @@ def fit_softening(log: Log, heat: Recording, calibration: Calibration) -> Soften
 
 
 def figure(section: Section, found: SofteningFit) -> None:
-    """Softening in the report."""
     section.heading("Stiffness over temperature and its history")
     hours = found.time_s / 3600.0
     factors = [

@@ -53,18 +53,14 @@ _CLOUD = Style("#aab4c0", mode="markers", size=3.0)
 
 @dataclass(frozen=True)
 class Candidate:
-    """One combination of effects in the choice of structure, fitted on the first halves of the random logs.
-
-    Attributes:
-        held_out: (error of the stiffness path, reference force) in N on what was not fitted, one pair per log; without a
-            random log, on each slow log of a fit to the others of its pads, and to all where it is the only one.
-        clear: every amplitude is significant.
-    """
+    """One combination of effects in the choice of structure, fitted on the first halves of the random logs."""
 
     effects: tuple[Effect, ...]
     fit: DynamicsFit
+    #: (error of the stiffness path, reference force) in N on what was not fitted, one pair per log; without a random log, on
+    #: each slow log of a fit to the others of its pads, and to all where it is the only one.
     held_out: list[Errors]
-    clear: bool
+    clear: bool  #: every amplitude is significant
 
     @property
     def held_out_rmse(self) -> float:
@@ -73,25 +69,16 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class StiffnessStep(Step):
-    """Curves, dynamics and effects.
+    """Curves, dynamics and effects."""
 
-    Attributes:
-        pads: the logs.
-        fit: over all pads at once.
-        candidates: combinations that were compared.
-        chosen: one of them.
-        separate: fits of each pair of pads alone, where it has random logs.
-        reached_N: largest force of the logs.
-        plain_N: RMS error on each slow log of a cubic of the angle for each way that is fitted to the others of its pads; None
-            where nothing was left out so.
-    """
-
-    pads: list[Pads]
-    fit: DynamicsFit
-    candidates: list[Candidate]
+    pads: list[Pads]  #: the logs
+    fit: DynamicsFit  #: over all pads at once
+    candidates: list[Candidate]  #: combinations that were compared
     chosen: Candidate
-    separate: list[DynamicsFit]
-    reached_N: float
+    separate: list[DynamicsFit]  #: fits of each pair of pads alone, where it has random logs
+    reached_N: float  #: largest force of the logs
+    #: RMS error on each slow log of a cubic of the angle for each way that is fitted to the others of its pads; None where
+    #: nothing was left out so.
     plain_N: float | None = None
 
     @property
@@ -108,11 +95,7 @@ class StiffnessStep(Step):
 
 
 def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
-    """Curves, dynamics and effects.
-
-    Args:
-        pads: in ascending order of thickness, for each of which ``nominal`` has a curve.
-    """
+    """Curves, dynamics and effects. ``pads``: in ascending order of thickness, for each of which ``nominal`` has a curve."""
     effects = [combination for count in range(len(OPTIONAL) + 1) for combination in combinations(OPTIONAL, count)]
     candidates = [_candidate(pads, nominal, combination) for combination in effects]
     left_out = all(own.random or len(own.logs) > 1 for own in pads)
@@ -201,7 +184,6 @@ def _choose(candidates: list[Candidate], worth: float) -> Candidate:
 
 
 def section(page: Page, step: StiffnessStep) -> None:
-    """Curves and dynamics in the report."""
     curves = page.section(
         "Characteristic curves",
         "Clamp force over motor angle past contact (thesis 2.1, 2.2). Points: slow clamp and release; line: the static curve "

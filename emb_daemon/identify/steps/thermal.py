@@ -42,12 +42,9 @@ _NEEDED = {
 
 @dataclass(frozen=True)
 class Temperatures:
-    """One log's modelled temperatures and its thermocouples, every half second.
-
-    Attributes:
-        measured, known, unknown: shape (9, n), degC: inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; ``known`` with
-            the brake torque measured, ``unknown`` without it.
-    """
+    """One log's modelled temperatures and its thermocouples, every half second. ``measured``, ``known``, ``unknown``: shape
+    (9, n), degC: inner pad at 2, 4, 6, 8 mm, outer pad at the same, disc; ``known`` with the brake torque measured,
+    ``unknown`` without it."""
 
     time_s: np.ndarray
     measured: np.ndarray
@@ -57,33 +54,27 @@ class Temperatures:
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalStep(Step):
-    """Thermal section.
+    """Thermal section."""
 
-    Attributes:
-        fitted, unseen: recordings that fitted, and logs that validate, by name.
-        hot: logs that fitted in which the brake works as in service: force over heat.
-        terms: of the heat balance, that these logs prove beside it.
-        left_K, follows: RMS that is clearly left of the temperatures nevertheless, and the signal that it follows most.
-        heat: pads and disc; None without a log that heats the pads, and everything below is then empty.
-        figures: RMSE on logs that were not fitted, by name with unit, once `validate`d.
-        achieved_K: the worst of these temperatures; None without one.
-        residuals: the same for what was fitted.
-    """
-
+    #: ``fitted`` and ``unseen``: recordings that fitted, and logs that validate, by name.
     fitted: dict[str, Recording]
     unseen: dict[str, Log] = field(default_factory=dict, repr=False)
+    #: Logs that fitted in which the brake works as in service: force over heat.
     hot: tuple[Log, ...] = field(default=(), repr=False)
-    terms: tuple[Term, ...] = ()
+    terms: tuple[Term, ...] = ()  #: of the heat balance, that these logs prove beside it
+    #: ``left_K`` and ``follows``: RMS that is clearly left of the temperatures nevertheless, and the signal that it follows
+    #: most.
     left_K: float = 0.0
     follows: str = ""
-    heat: Step | None = None
+    heat: Step | None = None  #: pads and disc; None without a log that heats the pads, and everything below is then empty
     law: CoolingLaw | None = None
     friction: FrictionFit | None = None
     softening: SofteningFit | None = None
     temperatures: dict[str, Temperatures] = field(default_factory=dict)
+    #: RMSE on logs that were not fitted, by name with unit, once `validate`d.
     figures: dict[str, float] = field(default_factory=dict)
-    achieved_K: float | None = None
-    residuals: dict[str, float] = field(default_factory=dict)
+    achieved_K: float | None = None  #: the worst of these temperatures; None without one
+    residuals: dict[str, float] = field(default_factory=dict)  #: the same for what was fitted
 
 
 def _attempt(campaign: Campaign, action, *arguments):
@@ -96,12 +87,8 @@ def _attempt(campaign: Campaign, action, *arguments):
 
 
 def identify(campaign: Campaign, cold: Calibration) -> ThermalStep:
-    """Thermal section of the calibration.
-
-    Args:
-        cold: what is known without it: softening is identified with its stiffness path, and pads are judged as in a car by the
-            whole estimator, its own clamp force heating them.
-    """
+    """Thermal section of the calibration. ``cold``: what is known without it: softening is identified with its stiffness path,
+    and pads are judged as in a car by the whole estimator, its own clamp force heating them."""
     logs, unseen = _logs(campaign)
     recordings = {name: found for name, log in logs.items() if (found := _attempt(campaign, _fitting, log)) is not None}
     if not recordings:
@@ -241,7 +228,6 @@ def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibra
 
 
 def _note_errors(name: str, error: np.ndarray, into: dict[str, float]) -> None:
-    """RMSE of what was measured."""
     for part, rows in (("pads", error[:8]), ("disc", error[8])):
         if np.isfinite(rows).any():
             into[name.format(part)] = rmse(rows)
@@ -275,7 +261,6 @@ def _notes(heat, law, rubbed, softened) -> tuple[str, ...]:
 
 
 def section(page: Page, step: ThermalStep, calibration: Calibration) -> None:
-    """Heat in the report."""
     part = page.section("Pads and disc: heat")
     if step.heat is None:
         part.text(

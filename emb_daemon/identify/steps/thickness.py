@@ -20,12 +20,7 @@ _NEED_CURVE = "slow clamp and release from the released position to a tenth of t
 
 @dataclass(frozen=True, kw_only=True)
 class ThicknessStep(Step):
-    """Curves over pad thickness; nothing of the calibration.
-
-    Attributes:
-        curves: one per thickness.
-        left_out: `left_out_errors`.
-    """
+    """Curves, one per pad thickness, and `left_out_errors`; nothing of the calibration."""
 
     curves: list[CurveFit]
     left_out: np.ndarray
@@ -35,8 +30,7 @@ class ThicknessStep(Step):
 
         A straight line between neighbours errs by (t - a)(b - t) times half the curvature, which is found by leaving out each
         inner thickness. A single curve is used for all thicknesses; its error is the change of the pads' part of the
-        compliance.
-        """
+        compliance."""
         thicknesses = np.array([curve.thickness_mm for curve in self.curves])
         if len(thicknesses) == 1:
             return _PADS_PART * abs(float(thickness_mm / thicknesses[0]) - 1.0)

@@ -45,13 +45,8 @@ _NEED_TRAINING = "clamp and release with the reference force, at full frame rate
 
 @dataclass(frozen=True)
 class TorqueFit:
-    """Parameters of the torque path.
-
-    Attributes:
-        values: by the calibration's keys (`KEYS`).
-        covariance: in their order.
-        residuals: unexplained current by log path: (row of the log, A).
-    """
+    """Parameters of the torque path. ``values``: by the calibration's keys (`KEYS`); ``covariance``: in their order;
+    ``residuals``: unexplained current by log path: (row of the log, A)."""
 
     values: dict[str, float]
     covariance: np.ndarray
@@ -80,13 +75,8 @@ class TorqueFit:
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueStep(Step):
-    """Motor and friction.
-
-    Attributes:
-        fit: over all random logs of the campaign's pads, or over drives if there are none.
-        logs: those that were fitted.
-        gears: (training log, fit) for each state of wear of the gear.
-    """
+    """Motor and friction, fitted to ``logs``: all random ones of the campaign's pads, or drives if there are none. ``gears``:
+    (training log, fit) for each state of wear of the gear."""
 
     fit: TorqueFit
     logs: list[Log]
@@ -162,8 +152,7 @@ def fit_torque(logs: list[Log], calibration: Calibration, sheet: Datasheet) -> T
     """Instrumental-variable regression, and a one-dimensional search for the presliding angle.
 
     Of the calibration only the gear is used. The datasheet's torque constant and inertia are priors; the presliding angle is
-    not known better than its resolver count. What logs do not excite keeps a wide prior, and a large sigma.
-    """
+    not known better than its resolver count. What logs do not excite keeps a wide prior, and a large sigma."""
     parts = [_Regression(log, calibration) for log in logs]
     nominal, precision = _wide_prior(sheet)
 
@@ -246,20 +235,13 @@ def _with_priors(values, covariance, sheet: Datasheet) -> tuple[np.ndarray, np.n
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Unexplained current of a fit on any log, one entry per cycle.
-
-    Attributes:
-        rows: of the log.
-        current_A: unexplained.
-        friction_mean: friction state, -1 to 1.
-        force_N: mean load of the reduction: clamp force and release spring, times the gear's slope over its mean.
-    """
+    """Unexplained current of a fit on any log, one entry per cycle."""
 
     found: TorqueFit
-    rows: np.ndarray
-    current_A: np.ndarray
-    friction_mean: np.ndarray
-    force_N: np.ndarray
+    rows: np.ndarray  #: of the log
+    current_A: np.ndarray  #: unexplained
+    friction_mean: np.ndarray  #: friction state, -1 to 1
+    force_N: np.ndarray  #: mean load of the reduction: clamp force and release spring, times the gear's slope over its mean
 
 
 def unexplained_current(log: Log, found: TorqueFit, calibration: Calibration, hot: bool = False) -> Unexplained:
@@ -283,7 +265,6 @@ _ROWS = (
 
 
 def section(page: Page, step: TorqueStep) -> None:
-    """Torque balance in the report."""
     part = page.section(
         "Torque balance",
         "Current explained by force, acceleration and friction (thesis 2.4, 4.1, 4.2). The current is noisy and is what is "
