@@ -35,6 +35,9 @@ LATE_CYCLES = 3
 _JITTER_NS = 2 * CYCLE_NS
 #: Number of samples on which counter and clock must have agreed before the counter takes precedence over the clock.
 _AGREED = 3
+#: Longest delay for which the counter is used although the clock says otherwise: that of a bus or a machine that was held up.
+#: Afterwards there is no estimate either (`estimator.step.SILENCE_S`), and a counter that does not fit may have begun anew.
+_HELD_UP_NS = 100_000_000
 #: Number of cycles of its message after which an input is reported as lost, and the age up to which the models use its last
 #: value: the same number of cycles of the slowest message, the vehicle's status at 100 ms. Pads take minutes to warm.
 _REPORTED_CYCLES, _USABLE_NS = 25, 2_500_000_000
@@ -264,7 +267,8 @@ def _cycles(corner, counter, time_ns):
 
     The Counter gives the number of cycles modulo 15, whatever the delay of the frame. It is used as long as delays of frames
     are made up for by later ones. In a log at a reduced rate the Counter counts frames instead of cycles, and a sender can
-    pause: then the delay stays or grows, and the time of arrival is used until both agree again."""
+    pause, or begin anew with any counter: then the delay is too long, stays or grows, and the time of arrival is used until
+    both agree again."""
     step = (counter - corner.counter) % COUNTER_MODULO
     if step == 0:
         step = COUNTER_MODULO
@@ -281,7 +285,7 @@ def _cycles(corner, counter, time_ns):
         corner.clock_ns += step * CYCLE_NS + late // 16
         return step
     recovering = corner.late_ns == 0 or late < corner.late_ns - CYCLE_NS // 2
-    if corner.agreed == _AGREED and late > 0 and recovering:
+    if corner.agreed == _AGREED and 0 < late <= _HELD_UP_NS and recovering:
         corner.late_ns = late
         corner.clock_ns += step * CYCLE_NS
         return step

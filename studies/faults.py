@@ -662,6 +662,22 @@ def power_cycle(rng, moments, size):
 
 
 @_family
+def controller_restart(rng, moments, size):
+    """The motor's controller alone loses power, and counts from another zero."""
+    at, off_s, shift = pick_sometime(rng, moments), draw_size(rng, 0.15, 5.0), float(rng.uniform(-100.0, 100.0))
+    silent = during(lose(wire.RESOLVER, wire.CURRENT), at, at + off_s)
+    shifted = during(alter(wire.RESOLVER, wire.MOTOR_ANGLE, lambda values, _: values + shift), at + off_s)
+    return Fault(f"{off_s:.2g} s, zero {shift:+.0f} rad", at, bus=chain(silent, shifted))
+
+
+@_family
+def bus_lost(rng, moments, size):
+    """All messages for a while."""
+    at, off_s = pick_sometime(rng, moments), draw_size(rng, 0.15, 5.0)
+    return Fault(f"{off_s:.2g} s", at, bus=during(lose(*_IDS), at, at + off_s))
+
+
+@_family
 def daemon_restart(rng, moments, size):
     at = pick_driving(rng, moments) if rng.random() < 0.5 else pick_clamped(rng, moments)
     return Fault("", at, restarts=((at, 0.5),))

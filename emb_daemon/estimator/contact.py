@@ -72,8 +72,7 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
         if not loose:
             # A released brake is not held for so long: the measured current is an offset of the sensor.
             s.error[OFFSET] += s.plausibility.torque_mean
-    elif s.start_angle == np.inf and released and loose and s.still_s >= _STILL_S and s.past_contact < 0.0:
-        # A log at a reduced rate that began on the way counts as open, but its first angle was no released position.
+    elif _was_on_its_way(s, p, m) and released and loose and s.still_s >= _STILL_S and s.past_contact < 0.0:
         place_contact(s, p, m.angle)
         s.start_angle = m.angle
     elif not s.seen:
@@ -82,6 +81,14 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
         open_yet = m.has_status and m.park_brake == 0.0 and not s.full_rate
         s.unknown = not (loose and released) and not open_yet
     s.seen = True
+
+
+@njit
+def _was_on_its_way(s, p, m):
+    """Whether the motor was on its way where it was believed to be released: in a log at a reduced rate that began so, or
+    because it has opened further before any stroke has shown the contact."""
+    opened, _ = through_gear(p.gear, s.start_angle - m.angle)
+    return s.start_angle == np.inf or (not s.contact.confirmed and opened > _PASSED * s.clearance)
 
 
 @njit

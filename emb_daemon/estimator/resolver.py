@@ -28,7 +28,7 @@ AWAY = np.dtype(
 #: A speed beyond the motor's maximum by this factor (overspeed of IEC 60034-1), and an angle by this many rad more (half of
 #: what a contact angle jumps by at once), is no motion.
 SPEED_MARGIN = 1.2
-_ANGLE_MARGIN = 0.5
+ANGLE_MARGIN = 0.5
 #: Shares of the largest speed: what no motor gains within a cycle, as it would be at full speed within 8 ms, and no log that
 #: is interpolated from 100 Hz; how far the angle may move beside the last speed and still go on as before, as one that had
 #: gained the first would not: by half of that; and what nothing turns at, whatever voltage and field.
@@ -120,7 +120,7 @@ def follow_zero(s: Record, p: Record, m: Record, turned: float) -> bool:
     repeats = s.behind != 0.0 or (behind != 0.0 and abs(slip - behind) < unsure + _SPEED_GAIN * abs(behind))
     if abs(behind) > unsure and s.plausibility.still == 0 and not repeats:
         moved, sigma = slip - behind, hypot(_ZERO_RAD, _SPEED_GAIN * behind)
-    elif abs(jump) > SPEED_MARGIN * reach + _ANGLE_MARGIN and not repeats:
+    elif abs(jump) > SPEED_MARGIN * reach + ANGLE_MARGIN and not repeats:
         # The speed of a sample that is wrong may be wrong as well.
         moved, sigma = (slip, hypot(_ZERO_RAD, 0.5 * m.dt * (m.speed - s.speed))) if seen else (jump, reach)
     elif seen and min(abs(slip), abs(s.plausibility.apart + slip)) > by_delay + limit and not repeats:

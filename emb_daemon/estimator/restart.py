@@ -142,6 +142,22 @@ def why_implausible(snapshot: Record, p: Record) -> str:
     return ", ".join(name for name, is_possible in possible.items() if not is_possible)
 
 
+@njit
+def rest(s: Record, p: Record, elapsed_s: float) -> None:
+    """What is less certain after ``elapsed_s`` s in which nobody watched the brake."""
+    for i in range(STATES):
+        for own in (FAST, NOISE):
+            s.covariance[own, i] = s.covariance[i, own] = 0.0
+    s.error[FAST] = s.error[NOISE] = 0.0
+    s.covariance[FAST, FAST] = 1.0
+    s.covariance[NOISE, NOISE] = sq(p.torque_constant * p.current_sigma)
+    add_rest(s.covariance, p, elapsed_s)
+    doubt_memory(s, p, ordinary_stop(p, AFTER_A_RESTART), max(elapsed_s - SNAPSHOT_S, 0.0))
+    s.winding *= exp(-elapsed_s / WINDING_S)
+    s.housing *= exp(-elapsed_s / HOUSING_S)
+    s.temperature_sigma += min(_UNSEEN_K_PER_S * elapsed_s, _UNSEEN_K)
+
+
 @entry(STATE, PARAMETERS, SNAPSHOT, float)
 def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     """Prepare a STATE that has seen nothing yet with a SNAPSHOT of ``elapsed_s`` seconds ago.
@@ -153,24 +169,15 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     for i in range(len(CREEPS)):
         s.creep[i] = snapshot.creep[i]
     copy_errors(s.error, s.covariance, snapshot.error, snapshot.covariance)
-    for i in range(STATES):
-        for own in (FAST, NOISE):
-            s.covariance[own, i] = s.covariance[i, own] = 0.0
-    s.error[FAST] = s.error[NOISE] = 0.0
-    s.covariance[FAST, FAST] = 1.0
-    s.covariance[NOISE, NOISE] = sq(p.torque_constant * p.current_sigma)
-    add_rest(s.covariance, p, elapsed_s)
-    doubt_memory(s, p, ordinary_stop(p, AFTER_A_RESTART), max(elapsed_s - SNAPSHOT_S, 0.0))
     s.alignment.delay, s.alignment.lag, s.lateness.filtered = snapshot.delay, snapshot.lag, snapshot.filtered
-    s.winding = snapshot.winding * exp(-elapsed_s / WINDING_S)
-    s.housing = snapshot.housing * exp(-elapsed_s / HOUSING_S)
+    s.winding, s.housing = snapshot.winding, snapshot.housing
     terms.resume(s.effects.terms, snapshot.terms_memory, elapsed_s)
     if snapshot.temperature_known:
         _copy_pads(s.pads, snapshot.pads)
         s.disc, s.history = snapshot.disc, snapshot.history
-        s.temperature_sigma = snapshot.temperature_sigma + min(_UNSEEN_K_PER_S * elapsed_s, _UNSEEN_K)
-        s.history_sigma = snapshot.history_sigma
+        s.temperature_sigma, s.history_sigma = snapshot.temperature_sigma, snapshot.history_sigma
         s.rested_s = min(max(elapsed_s, CYCLE_S), _FOLLOWED_S)
+    rest(s, p, elapsed_s)
 
 
 @njit

@@ -26,6 +26,7 @@ from emb_daemon.estimator.paths import (
     torque_path,
 )
 from emb_daemon.estimator.resolver import (
+    ANGLE_MARGIN,
     LONG_AGO_S,
     MOST_SLIP_RAD,
     SPEED_MARGIN,
@@ -34,6 +35,7 @@ from emb_daemon.estimator.resolver import (
     follow_zero,
     may_come_back,
 )
+from emb_daemon.estimator.restart import rest as rest_unwatched
 from emb_daemon.estimator.rewind import forget_stroke, go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
@@ -114,6 +116,17 @@ def _start(s, p, m):
                 s.covariance[i, i] = 0.0
         else:
             doubt_memory(s, p, ordinary_stop(p, AT_A_START), 0.0)
+    _begin_at(s, p, m)
+    forget_common(s)
+    if s.resumed:
+        weigh_common(s, p)
+    s.largest_slip[:] = MOST_SLIP_RAD
+    keep_all(s)
+
+
+@njit
+def _begin_at(s, p, m):
+    """Begin where the motor is now: it is released there, until the start says something else."""
     s.gear_zero = m.angle
     # Of a motor that turns at the first sample the released position is unknown.
     s.start_angle = m.angle if abs(m.speed) < STANDING_RAD_PER_S else np.inf
@@ -124,10 +137,36 @@ def _start(s, p, m):
     s.torque_age = s.no_current_s = 1e9
     s.away.seconds = LONG_AGO_S
     open_all(s, p)
-    forget_common(s)
-    if s.resumed:
-        weigh_common(s, p)
-    s.balance, s.largest_slip[:] = np.nan, MOST_SLIP_RAD
+    s.balance = np.nan
+
+
+@njit
+def _may_have_restarted(s, p, m):
+    """Whether the motor's controller has been silent for so long that it may count from another zero: it is elsewhere by what
+    it counts."""
+    return m.dt > SILENCE_S and abs(m.angle - s.angle) > ANGLE_MARGIN and p.clearance_sigma > 0.0
+
+
+@njit
+def _begin_again(s, p, m):
+    """After a silence of the motor's controller: as after a restart of this program what was learned stays, and where the
+    contact is has to be seen."""
+    if not (s.unknown or s.contact.lost):
+        s.clearance, s.clearance_sigma = p.clearance + s.contact_angle - s.contact_anchor, sqrt(s.covariance[CONTACT, CONTACT])
+    rest_unwatched(s, p, m.dt)
+    # What is asked of the brake may have been heard before the silence: only a motor that stands shows that it is released.
+    s.unknown, s.seen, s.braked = True, True, False
+    # In the silence nobody saw it stand.
+    s.still_s, s.passed, s.opposing = -m.dt, 0.0, 0.0
+    s.angle = s.slid_angle = m.angle
+    s.speed, s.friction_state, s.strayed = m.speed, 0.0, np.nan
+    s.drifted = s.stood_s = s.drifting_s = s.contact_age_s = s.offset_age_s = 0.0
+    believe_resolver(s.plausibility)
+    forget_wander(s.wander)
+    place_contact(s, p, m.angle)
+    forget_level(s.contact)
+    s.contact.engaged = False
+    _begin_at(s, p, m)
     keep_all(s)
 
 
@@ -167,6 +206,8 @@ def _advance(s, p, m, angle, speed, out):
     """`step` with current and motion of one moment; ``angle`` and ``speed`` as they came."""
     if not s.started:
         _start(s, p, m)
+    elif _may_have_restarted(s, p, m):
+        _begin_again(s, p, m)
     believe_speed(s, p, m)
     if p.clearance_sigma > 0.0:
         effects.doubt_phase(p.effects, s.effects, m)
