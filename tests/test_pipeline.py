@@ -217,6 +217,20 @@ def test_after_a_gap_time_is_what_passed(car, gap):
     assert rows["cycle"][-1] == 34 + gap
 
 
+@pytest.mark.parametrize("skipped", range(15))
+def test_after_a_silence_no_counter_says_that_less_has_passed(car, skipped):
+    """Of a sender that begins anew it may be any. One that passed for a bus that was held up moved a contact by 30 rad."""
+    pipeline = Pipeline(car, ("FL",))
+    pipeline.begin(0)
+    after = np.concatenate(_sliding(10, first=30 + skipped))
+    after["time_ns"] += (60 - skipped) * CYCLE_NS
+    frames = np.concatenate([*_sliding(30), after])
+    _, count = pipeline.collect(frames, predictions=False)
+    rows = pipeline.samples[:count]
+    assert count == 40 and rows["dt"][30] == pytest.approx(0.004 * 61, abs=0.009)
+    assert rows["dt"][30:].sum() == pytest.approx(0.004 * 70, abs=0.009)
+
+
 @pytest.mark.parametrize("held_ms", [20, 35, 45])
 def test_delayed_frames_change_no_estimate(car, held_ms):
     """A burst after a hold-up: the counter says what passed, the clock does not, though it may be closer to another turn."""

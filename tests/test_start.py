@@ -530,3 +530,66 @@ def test_a_torque_at_power_on_may_be_a_clamped_brake_or_an_offset_of_as_much(p, 
         == pytest.approx(P[OFFSET, OFFSET] / (leverage * s["factor"] * slope), rel=1e-3)
     )
     assert P[CONTACT, CONTACT] * P[OFFSET, OFFSET] >= P[CONTACT, OFFSET] ** 2
+
+
+def _silent(p, silent_s, zero=0.0, held=False):
+    """Rows of five stops, the motor's controller silent for ``silent_s`` s in the third, while it closes or while it holds,
+    and counting from ``zero`` rad afterwards; the force, the row after the silence, and that of the next release."""
+    path = brake.stops(p, 5, held_s=2.0)
+    rows, force = brake.samples(p, path)
+    rows = brake.noisy(rows, p)
+    stop = len(path) // 5
+    begin = 2 * stop + int(np.flatnonzero(force[2 * stop : 3 * stop] > 100.0)[0]) + (125 if held else 0)
+    end = begin + round(silent_s / 0.004)
+    rows["brake_request"] = np.where(force > 1.0, 4000.0, 0.0)
+    rows["angle"][end:] += zero
+    rows["dt"][end] = (end - begin + 1) * 0.004
+    gone = np.arange(begin, end)
+    release = end + int(np.flatnonzero(path[end:] < 0.5 * p["clearance"])[0])
+    return np.delete(rows, gone), np.delete(force, gone), begin, release - len(gone)
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("zero", [-37.0, 8.0, 60.0])
+@pytest.mark.parametrize("silent_s", [0.12, 1.0])
+def test_a_motor_controller_that_was_silent_and_counts_from_another_zero_opens_no_brake(p, silent_s, zero, held):
+    """Silently up to 12 kN for as long as it clamped: until it has opened, the torque alone and contact unknown; then both."""
+    rows, force, first, release = _silent(p, silent_s, zero, held)
+    estimates = estimate(rows, p)
+    clamped, later = slice(first, release), slice(release + 250, None)
+    assert np.all(_unknown(estimates[clamped])) and np.all(estimates["source"][clamped] == r.TORQUE_ONLY)
+    assert _covered(estimates[first:], force[first:])
+    assert np.mean(estimates["source"][later] == r.FUSED) > 0.9
+    assert _rms((estimates["force"] - force)[later]) < 100.0
+
+
+def test_a_motor_that_stands_where_it_stood_before_a_silence_counts_from_the_same_zero(p):
+    rows, _, first, _ = _silent(p, 1.0, held=True)
+    estimates = estimate(rows, p)
+    assert not np.any(_unknown(estimates[first:])) and np.all(estimates["source"][first:] != r.TORQUE_ONLY)
+
+
+def test_no_controller_starts_anew_within_a_tenth_of_a_second(p):
+    """Some frames that a bus loses while the motor moves cost nothing."""
+    rows, _, first, _ = _silent(p, 0.08)
+    assert not np.any(_unknown(estimate(rows, p)[first:]))
+
+
+def test_what_was_asked_before_a_silence_says_nothing_of_what_moved_in_it(p):
+    """The vehicle's last status said that nobody brakes; the motor closes, and has not been seen to stand."""
+    rows, force, first, release = _silent(p, 1.0, zero=8.0)
+    rows["brake_request"][:release] = 0.0
+    estimates = estimate(rows, p)
+    assert np.all(_unknown(estimates[first : first + 60])) and _covered(estimates[first:], force[first:])
+
+
+@pytest.mark.parametrize("closed", [3.0, 7.0])
+def test_a_motor_that_opens_further_than_where_it_stood_at_power_on_was_not_released_there(p, closed):
+    """It stood half open for a second, nobody asking anything; its clearance counts from where it stands open."""
+    away = np.concatenate([np.full(250, closed), np.linspace(closed, 0.0, 100), np.zeros(100)])
+    path = np.concatenate([away, *[np.concatenate([brake.clamp(p, 12.0, 0.3), brake.clamp(p, 12.0, 0.3)[::-1]])] * 2])
+    rows, force = brake.samples(p, path)
+    rows["brake_request"] = np.where(force > 1.0, 4000.0, 0.0)
+    estimates = estimate(brake.noisy(rows, p), p)
+    assert _covered(estimates[350:], force[350:])
+    assert estimates["contact_angle"][449] == pytest.approx(p["clearance"], abs=0.3)
