@@ -19,6 +19,7 @@ from emb_daemon.errors import InputError
 from emb_daemon.estimator.answer import answer
 from emb_daemon.estimator.records import ESTIMATE, SAMPLE, new_state
 from emb_daemon.estimator.status import names
+from emb_daemon.estimator.step import SILENCE_S
 from emb_daemon.logs.mapping import Mapping as Mapping
 from emb_daemon.logs.resample import filled, frames_of
 from emb_daemon.logs.series import Series
@@ -248,7 +249,8 @@ class Estimator:
                 motor must stand; otherwise the contact is unknown until both are seen.
             speed_rad_per_s: motor speed at the sample.
             current_A: torque-producing current, mean over the 4 ms before the sample; None if it is missing.
-            dt_s: time since the last sample; ignored at the first call.
+            dt_s: time since the last sample; ignored at the first call. After more than 0.1 s, and more than usual, an angle
+                that has moved may count from another zero: the contact is then unknown as at the start.
             backplates_C: inner and outer backing plate; None if unknown, and the pads' temperatures then stay unknown.
             caliper_C: if None, the mean of the backing plates is used.
             wheel_speed_rad_per_s, wheel_pulse: speed of the disc, and 96 counts per turn modulo 4096; None if unknown.
@@ -267,7 +269,7 @@ class Estimator:
             raise ValueError(f"dt_s = {dt_s}: expected a time above zero")
         row = self._sample[0]
         row["dt"] = dt_s if self._state["started"][0] else 0.0
-        row["angle"], row["speed"] = angle_rad, speed_rad_per_s
+        row["angle"], row["speed"], row["was_silent"] = angle_rad, speed_rad_per_s, dt_s > SILENCE_S
         row["has_current"], row["current_q"] = _known(current_A)
         row["has_sensor_force"], row["sensor_force"] = _known(sensor_force_N)
         row["has_thermocouple"] = backplates_C is not None and all(map(isfinite, backplates_C))

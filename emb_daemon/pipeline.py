@@ -49,7 +49,8 @@ SHOWN_NS = 1_000_000_000
 #: ``cycle``: cycles since the first sample; ``announced``: cycles up to the last row; ``predicted``: rows since then;
 #: ``clock_ns``: the last sample's time by the sender's counter; ``late_ns``: its delay, if later samples are to make up for
 #: it; ``agreed``: number of samples in a row on which counter and clock agreed; ``second_sender_ns``: when another node last
-#: sent one of the daemon's messages; ``unproven``: authentication is required and a key is missing.
+#: sent one of the daemon's messages; ``unproven``: authentication is required and a key is missing; ``was_silent``: whether
+#: nothing came of its motor's controller for a tenth of a second before this sample, of which something ``heard_ns`` last.
 CORNER = np.dtype(
     [
         *fields("?", "active started"),
@@ -57,7 +58,8 @@ CORNER = np.dtype(
         *fields("f8", "pending_angle pending_speed"),
         *fields("i8", "sample_ns counter cycle announced predicted clock_ns late_ns agreed second_sender_ns"),
         *fields("i8", "pending_late_ns sample_late_ns"),
-        ("unproven", "?"),
+        *fields("?", "unproven was_silent"),
+        ("heard_ns", "i8"),
     ],
     align=True,
 )
@@ -200,6 +202,7 @@ def _collect(b, frames, start, predictions, count):
             break
         start += 1
         slot, verdict = receive(frame, b.receptions, b.layout[0])
+        _hear(b, slot, frame.time_ns)
         if verdict == SECOND_SENDER:
             _record_second_sender(b, frame)
         if verdict != ACCEPTED or slot >= wire.WHEEL_SPEED or slot % wire.CORNER_MESSAGES > wire.CURRENT:
@@ -221,6 +224,16 @@ def _collect(b, frames, start, predictions, count):
         if corner.pending >= 0 and _paired(b, index, wire.CURRENT):
             count = _complete(b, index, count)
     return start, count
+
+
+@njit
+def _hear(b, slot, time_ns):
+    """Note whether a corner's motor controller was silent for so long that it may have been without power: nothing came of
+    it, not even a frame that is refused."""
+    if 0 <= slot < wire.WHEEL_SPEED and slot % wire.CORNER_MESSAGES in (wire.RESOLVER, wire.CURRENT):
+        corner = b.corners[slot // wire.CORNER_MESSAGES]
+        corner.was_silent = corner.was_silent or time_ns - corner.heard_ns > _HELD_UP_NS
+        corner.heard_ns = time_ns
 
 
 @njit
@@ -306,6 +319,7 @@ def _complete(b, index, count):
     cycles = _cycles(corner, corner.pending, now) if corner.started else 0
     row.is_prediction = False
     row.dt = cycles * CYCLE_S
+    row.was_silent, corner.was_silent = corner.was_silent, False
     row.angle = corner.pending_angle
     row.speed = corner.pending_speed
     # The error of a value that its sender reports as degraded is unknown. Instead of the current the force can use the

@@ -543,7 +543,7 @@ def _silent(p, silent_s, zero=0.0, held=False):
     end = begin + round(silent_s / 0.004)
     rows["brake_request"] = np.where(force > 1.0, 4000.0, 0.0)
     rows["angle"][end:] += zero
-    rows["dt"][end] = (end - begin + 1) * 0.004
+    rows["dt"][end], rows["was_silent"][end] = (end - begin + 1) * 0.004, True
     gone = np.arange(begin, end)
     release = end + int(np.flatnonzero(path[end:] < 0.5 * p["clearance"])[0])
     return np.delete(rows, gone), np.delete(force, gone), begin, release - len(gone)
@@ -569,10 +569,13 @@ def test_a_motor_that_stands_where_it_stood_before_a_silence_counts_from_the_sam
     assert not np.any(_unknown(estimates[first:])) and np.all(estimates["source"][first:] != r.TORQUE_ONLY)
 
 
-def test_no_controller_starts_anew_within_a_tenth_of_a_second(p):
-    """Some frames that a bus loses while the motor moves cost nothing."""
-    rows, _, first, _ = _silent(p, 0.08)
-    assert not np.any(_unknown(estimate(rows, p)[first:]))
+@pytest.mark.parametrize(("silent_s", "name"), [(0.08, "dt"), (1.0, "was_silent")])
+def test_frames_that_a_bus_loses_move_no_zero(p, silent_s, name):
+    """Fewer than for a tenth of a second, or while something else is heard of the controller, or just the resolver's."""
+    rows, _, first, _ = _silent(p, silent_s)
+    rows["was_silent"] &= name == "dt"
+    estimates = estimate(rows, p)
+    assert np.all(estimates["source"][first:] != r.TORQUE_ONLY)
 
 
 def test_what_was_asked_before_a_silence_says_nothing_of_what_moved_in_it(p):

@@ -74,7 +74,8 @@ PARAMETERS = np.dtype(
 #: One row for the estimator. It is a resolver sample, or asks for a prediction ``age_cycles`` after the last
 #: one. ``dt`` s since the last sample; ``late_ns`` whole cycles by which it came later than the promptest; ``cycle`` its
 #: number since the first, ``elapsed_cycles`` since the last row; ``reasons`` what is amiss outside the estimator.
-#: ``brake_torque`` N m is a rig's, NaN in a car.
+#: ``brake_torque`` N m is a rig's, NaN in a car. ``was_silent``: whether the motor's controller sent nothing before it for so
+#: long that it may have been without power.
 SAMPLE = np.dtype(
     [
         *fields("i8", "time_ns late_ns cycle elapsed_cycles age_cycles corner counter reasons"),
@@ -84,7 +85,7 @@ SAMPLE = np.dtype(
             "dt angle speed current_q sensor_force inner_backplate outer_backplate caliper ambient wheel_speed wheel_pulse "
             "vehicle_speed park_brake brake_request brake_torque",
         ),
-        *fields("?", "has_current has_sensor_force has_thermocouple has_wheel_speed has_wheel_pulse has_status"),
+        *fields("?", "has_current has_sensor_force has_thermocouple has_wheel_speed has_wheel_pulse has_status was_silent"),
     ],
     align=True,
 )

@@ -47,6 +47,8 @@ INPUTS = (
     Signal("has_wheel_speed", "has_wheel_speed", "", "wheel_speed_rad_per_s is fresh", True),
     Signal("has_wheel_pulse", "has_wheel_pulse", "", "wheel_pulse is fresh", True),
     Signal("has_status", "has_status", "", "ambient_C, vehicle_speed_m_per_s, park_brake and brake_request are fresh", True),
+    Signal("was_silent", "was_silent", "", "the motor's controller was silent for over 0.1 s: its zero may be another",
+           False),
     Signal("is_prediction", "is_prediction", "", "there is no sample: predict from the last one", False),
     Signal("reasons_outside", "reasons", "", "bits of DegradedReasons that are known outside the estimator", 0),
 )  # fmt: skip
