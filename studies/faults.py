@@ -662,6 +662,20 @@ def power_cycle(rng, moments, size):
 
 
 @_family
+def current_noise(rng, moments, size):
+    """White, or the hum of a supply, beyond what the calibration knows."""
+    amplitude, at, hums = size.current * draw_size(rng, 1.0, 8.0), pick_sometime(rng, moments), rng.random() < 0.5
+
+    def noisy(values, time_s):
+        if not hums:
+            return values + amplitude * rng.standard_normal(len(values))
+        # The samples that a batch of this corner has, a cycle apart.
+        return values + amplitude * np.sin(2.0 * np.pi * 49.3 * (time_s + 0.004 * np.arange(len(values))))
+
+    return current_fault(f"{amplitude:.2g} A {'hum' if hums else 'white'}", at, noisy)
+
+
+@_family
 def controller_restart(rng, moments, size):
     """The motor's controller alone loses power, and counts from another zero."""
     at, off_s, shift = pick_sometime(rng, moments), draw_size(rng, 0.15, 5.0), float(rng.uniform(-100.0, 100.0))

@@ -225,3 +225,29 @@ def test_a_motor_that_needs_torque_while_it_stands_may_hold_a_clamped_brake(p):
     estimates = estimate(rows, p)
     assert np.all(estimates["source"][30:] == r.TORQUE_ONLY) and np.all(estimates["reasons"][30:] & r.CONTACT_UNCERTAIN)
     assert np.all(estimates["sigma"][30:] > 1000.0)
+
+
+@pytest.mark.parametrize("hums", [False, True])
+def test_a_current_that_becomes_noisy_costs_the_force_nothing(parameters, hums):
+    """Its noise is what it is while the motor stands, not what it once was: taken for torque, it moved contact and stiffness
+    until the force was kilonewtons off beside a perfect angle."""
+    p = brake.ideal(parameters)
+    rows, force = brake.samples(p, brake.stops(p, 8))
+    rows, begun = brake.noisy(rows, p), len(rows) // 4
+    quiet, time_s = estimate(rows, p), 0.004 * np.arange(len(rows))
+    noise = 8.0 * np.sin(2.0 * np.pi * 49.3 * time_s) if hums else 5.0 * np.random.default_rng(3).standard_normal(len(rows))
+    rows["current_q"][begun:] += noise[begun:]
+    loud = estimate(rows, p)
+    last = slice(len(rows) // 2, None)
+    before, after = (np.sqrt(np.mean((found["force"] - force)[last] ** 2)) for found in (quiet, loud))
+    assert after < 1.5 * before
+    assert np.mean(np.abs(loud["force"] - force)[begun:] > 3.0 * np.hypot(loud["sigma"], 25.0)[begun:]) < 0.01
+
+
+def test_a_step_of_the_current_of_a_motor_that_stands_is_no_noise(parameters):
+    p, state = brake.ideal(parameters), new_state()
+    rows, _ = brake.samples(p, np.zeros(1000))
+    rows = brake.noisy(rows, p)
+    rows["current_q"][500:] += 20.0
+    estimate(rows, p, state)
+    assert state[0]["current_sigma"] < 1.3 * p["current_sigma"]

@@ -120,7 +120,7 @@ def _passed_clearance(s, p, m):
         s.opposing += (s.balance - s.opposing) / s.passed
     passed, _ = through_gear(p.gear, m.angle - s.start_angle)
     closed = s.clearance > 0.0 and passed > _PASSED * s.clearance and _is_lowest(s, p, s.start_angle)
-    sigma, _ = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * s.speed_sigma / CYCLE_S)
+    sigma, _ = torque_sigma(p.torque_constant * s.current_sigma, p.inertia * s.speed_sigma / CYCLE_S)
     free = abs(s.opposing) < _FREE * p.gear_gain * p.maximum_force
     return closed and s.passed > 0.0 and sigma / sqrt(s.passed) < 0.3 * _FREE * p.gear_gain * p.maximum_force and free
 
@@ -158,7 +158,7 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
         # The contact angle is held, as in diagnose; no calibration file can state that.
         engaged(c, x, 0.0)
         return
-    sigma, current_share = torque_sigma(p.torque_constant * p.current_sigma, p.inertia * s.speed_sigma / CYCLE_S)
+    sigma, current_share = torque_sigma(p.torque_constant * s.current_sigma, p.inertia * s.speed_sigma / CYCLE_S)
     limit = threshold(current_share, p.current_correlation_time, CYCLE_S)
     mean_force = 0.5 * (force_before + s.force)
     predicted = leverage * mean_force

@@ -198,7 +198,7 @@ def _spread(s, p, m):
 @njit
 def _predict(s, p, m, spread, warmth, known):
     """Time update of all hypotheses, then of the motor's heat."""
-    current_torque = p.torque_constant * p.current_sigma
+    current_torque = p.torque_constant * s.current_sigma
     noise = current_torque * current_torque
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     walked = s.sensitivity[1]
@@ -245,7 +245,7 @@ def _moving_variance(s, p, m):
     apart = LATE_CYCLES + (s.late + abs(effects.known_delay(p.effects))) / CYCLE_S
     late = apart * p.torque_constant * (m.current_q - s.current_before) if s.had_current else 0.0
     lag = max(s.alignment.lag, 0.0)
-    added = 2.0 * lag * (1.0 + lag) * sq(p.torque_constant * p.current_sigma)
+    added = 2.0 * lag * (1.0 + lag) * sq(p.torque_constant * s.current_sigma)
     return 2.0 * speed_torque * speed_torque + late * late + added
 
 
@@ -288,7 +288,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     out.torque_sigma = sqrt(out.torque_sigma * out.torque_sigma + slow / (leverage * leverage))
     out.innovation, out.innovation_sigma = first / leverage, sqrt(variance) / leverage
     s.beyond = first / leverage if trusted and m.angle != s.angle else np.nan
-    noise = (moving + sq(p.torque_constant * p.current_sigma)) / sq(leverage)
+    noise = (moving + sq(p.torque_constant * s.current_sigma)) / sq(leverage)
     s.beyond_variance = max(sq(out.torque_sigma) - _AVERAGED * noise, 0.0)
     if trusted and not known:
         watch_steps(s, p, first / sqrt(variance), m.speed, m.dt)
@@ -312,7 +312,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
             weigh_phases(s.phases, s.effects, leverage, first + followed, variance - fast)
         if not undecided(s.effects):
             uneven.learn(s.uneven, leverage, first + periodic, variance, m.dt)
-    current = p.torque_constant * p.current_sigma
+    current = p.torque_constant * s.current_sigma
     slow += lasting * lasting
     return sqrt(moving + slow), sqrt(current * current + slow)
 
@@ -539,7 +539,7 @@ def _count_against_resolver(s, p, m, turning_sigma, standing_sigma, torque, gain
     if m.has_current:
         steady(c, _motor_torque(s, s.error), accelerating, m.dt)
     if m.has_current and stands(c, m.angle):
-        noise = smoothed_sigma(p.torque_constant * p.current_sigma, p.current_correlation_time)
+        noise = smoothed_sigma(p.torque_constant * s.current_sigma, p.current_correlation_time)
         friction_sigma, load_sigma = _standing_sigmas(s, p, m)
         swings = hold(c, s.force, noise, gain, load, coulomb, friction_sigma, load_sigma, p.presliding_angle)
         # A latch holds the motor against any torque, and the stop of an open brake against one that opens it.

@@ -176,8 +176,9 @@ STATE = np.dtype(
         ("gain", "f8", (STATES,)),
         *fields("f8", "current_before current_change wanted"),
         ("had_current", "?"),
-        # Noise of the speed, rad/s: mean square of a motor that stands, and the larger of that and the calibration's.
-        *fields("f8", "speed_square speed_sigma"),
+        # Noise of the speed, rad/s, and of the current, A: mean square of a motor that stands, and the larger of that and the
+        # calibration's.
+        *fields("f8", "speed_square speed_sigma current_square current_sigma"),
         ("no_current_s", "f8"),
         ("trusted", "?"),
         # Contact angle as clearance or torque placed it, rad. Learned: stiffness over the calibration's, and contact angle

@@ -4,7 +4,7 @@
 computes a clamp force.
 """
 
-from math import sqrt
+from math import exp, sqrt
 
 import numpy as np
 
@@ -67,7 +67,7 @@ from emb_daemon.estimator.unknown import (
     set_priors,
     softening_sigma,
 )
-from emb_daemon.jit import Record, hypot, njit
+from emb_daemon.jit import Record, hypot, njit, sq
 from emb_daemon.models.alignment import align, aligned
 from emb_daemon.models.contact import forget_level
 from emb_daemon.models.fusion import CONTACT, CREEPS, SCALE, maximum_likelihood
@@ -91,6 +91,8 @@ _GOES_ON_S = 0.032
 _LED = 0.2
 #: Samples in which a motor that stands must have done so, and time over which its speed's noise is averaged, s.
 _HELD, _NOISE_S = 25, 0.5
+#: Standard deviations of the current's noise up to which a change counts as noise.
+_STEP = 5.0
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
 #: Standard deviations within which a stiffness is at its bound.
@@ -108,7 +110,7 @@ _UNCERTAIN_N, _UNCERTAIN_LEAST, _UNCERTAIN_MOST = 300.0, 0.01, 0.02
 def _start(s, p, m):
     s.started = True
     s.angle = s.slid_angle = m.angle
-    s.speed, s.speed_sigma = m.speed, p.speed_sigma
+    s.speed, s.speed_sigma, s.current_sigma = m.speed, p.speed_sigma, p.current_sigma
     if not s.resumed:
         s.clearance, s.clearance_sigma, s.scale = p.clearance, p.clearance_sigma, 1.0
         set_priors(s.covariance, p)
@@ -321,8 +323,21 @@ def _follow_age(s, p, m, turned, moved_zero):
 
 
 @njit
+def _follow_current_noise(s, p, m):
+    """Mean square of the current's noise, A2, by its changes while the motor stands. One change that is far larger than noise
+    is a step of what the motor is asked for."""
+    if m.has_current and s.had_current and p.current_sigma > 0.0:
+        alike = exp(-CYCLE_S / p.current_correlation_time) if p.current_correlation_time > 0.0 else 0.0
+        shown = 0.5 * sq(m.current_q - s.current_before) / (1.0 - alike)
+        shown = min(shown, sq(_STEP * s.current_sigma))
+        s.current_square += min(m.dt / _NOISE_S, 1.0) * (shown - s.current_square)
+
+
+@njit
 def _follow_noise(s, p, m):
     """How noisy the speed is, and how far it is off: a motor that stands has none."""
+    if s.plausibility.held > _HELD and m.angle == s.angle and m.dt <= ONE_CYCLE_S:
+        _follow_current_noise(s, p, m)
     if s.plausibility.held > _HELD and m.angle == s.angle:
         # An angle that is late still stays where it is while the motor turns.
         age = s.late + effects.known_delay(p.effects)
@@ -348,6 +363,7 @@ def _follow_noise(s, p, m):
             doubt_friction(s, m.angle)
             forget_level(s.contact)
     s.speed_sigma = max(sqrt(s.speed_square), p.speed_sigma)
+    s.current_sigma = max(sqrt(s.current_square), p.current_sigma)
 
 
 @njit
