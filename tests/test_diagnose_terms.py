@@ -787,15 +787,8 @@ def _filled(selection, terms, coefficient=1e-9):
     """A selection whose calibration holds so many terms, those added next to nothing."""
     bench = selection.model.bench
     [*own] = bench.calibration.terms
-    more = {
-        "port": "torque",
-        "signal": "motor_speed",
-        "shape": "constant",
-        "coefficient": coefficient,
-        "low": -1e9,
-        "high": 1e9,
-    }
-    own += [Term(name=f"term:{number}", **more) for number in range(terms - len(own))]
+    more = {"port": "torque", "signal": "motor_speed", "shape": "constant", "low": -1e9, "high": 1e9}
+    own += [Term(name=f"term:{number}", coefficient=coefficient, **more) for number in range(len(own), terms)]
     under = bench.under(msgspec.structs.replace(bench.calibration, terms=tuple(own)))
     return dataclasses.replace(selection, model=dataclasses.replace(selection.model, bench=under))
 
