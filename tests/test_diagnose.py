@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from functools import cache
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -73,6 +74,7 @@ def test_error_falls_to_that_of_a_brake_without_the_effect(uneven_disc):
 
 def test_report_keeps_the_contract(uneven_disc):
     folder, report = uneven_disc
+    assert report["no_room_for_a_term"] == []
     assert {"paths", "judged_on", "effects", "unexplained"} <= report.keys()
     assert {"stiffness", "torque", "fused"} <= report["paths"].keys()
     assert {effect["name"] for effect in report["effects"] if not effect.get("made")} == {effect.name for effect in REGISTRY}
@@ -329,6 +331,22 @@ def test_a_log_with_nothing_to_judge_by_is_refused(calibration):
     samples["has_current"] = False
     with pytest.raises(InputError, match="neither a clamp force reference nor motor current"):
         diagnose([dataclasses.replace(log, samples=samples)], calibration)
+
+
+def test_equations_are_printed_as_they_are(tmp_path, capsys, monkeypatch):
+    """Square brackets and colons of a term are no markup of a terminal."""
+    told = "[clamp force through a lag of 0.31 s]/4 N; in 5 % of the samples of term:fire:thickness it is a guess"
+    for where, name, value in (
+        ("diagnosis", "diagnose", SimpleNamespace(calibration=load_calibration(resource("config/calibration.yaml")))),
+        ("text", "verdict", told), ("text", "table", "[red]"), ("report", "report", {}), ("page", "page", ""),
+    ):  # fmt: skip
+        monkeypatch.setattr(f"emb_daemon.diagnose.{where}.{name}", lambda *_, value=value: value)
+    monkeypatch.setattr("emb_daemon.offline.load_log", lambda *_: None)
+    output = tmp_path / "[found]"
+    arguments = ["--calibration", str(resource("config/calibration.yaml")), "--output", str(output)]
+    assert main(["diagnose", str(tmp_path / "fit.log"), *arguments]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert told in printed and "[red]" in printed and "[found]" in printed
 
 
 @pytest.mark.parametrize("missing", ["log", "calibration"])

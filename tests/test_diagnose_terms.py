@@ -19,7 +19,7 @@ from emb_daemon.diagnose.comparison import errors
 from emb_daemon.diagnose.coordinates import Coordinate
 from emb_daemon.diagnose.diagnosis import _with_memory, diagnose, with_terms
 from emb_daemon.diagnose.evidence import Averaging, Evidence
-from emb_daemon.diagnose.forms import enumerate_forms, enumerate_products, harmonic, made_effect
+from emb_daemon.diagnose.forms import enumerate_forms, enumerate_products, harmonic, made_effect, rippling
 from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.page import page
 from emb_daemon.diagnose.prospects import Prospect, Search
@@ -28,8 +28,9 @@ from emb_daemon.diagnose.residuals import Bench
 from emb_daemon.diagnose.screening import Candidate, Screening
 from emb_daemon.diagnose.selection import TOO_LARGE, Selection, revise
 from emb_daemon.diagnose.signals import MANOEUVRES, outside_range
-from emb_daemon.diagnose.text import _outside, verdict
+from emb_daemon.diagnose.text import _full, _outside, verdict
 from emb_daemon.effects import REGISTRY
+from emb_daemon.effects.terms import MOST, PORTS
 from emb_daemon.offline import log_of
 from emb_daemon.plant.brake import SIGNALS as PLANT_SIGNALS
 from emb_daemon.plant.car import COUNT_RAD, COUNTER_RAD
@@ -37,14 +38,19 @@ from emb_daemon.wire.contract import CYCLE_S
 from studies.blind import campaign
 
 
-def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(calibration, monkeypatch):
+@pytest.fixture(scope="module")
+def rippled(calibration):
+    """A search on a brake whose gear ripples thrice in a turn, before anything was made for it."""
+    hidden = {"gear_mesh_ripple": {"cosine": 0.06, "order_per_turn": 3.0}}
+    bench = Bench([log_of(next(drives(calibration, 61, hidden)))], calibration)
+    start = Model.of(bench)
+    return Selection(start.refined({"torque"}), Screening(bench, start))
+
+
+def test_a_ripple_taken_at_a_side_lobe_ends_at_its_own_order(rippled, monkeypatch):
     """As it happens where something else was still missing when the order was chosen; beyond what its port may bear it is
     refused, and the search goes on."""
-    bench = Bench(
-        [log_of(next(drives(calibration, 61, {"gear_mesh_ripple": {"cosine": 0.06, "order_per_turn": 3.0}})))], calibration
-    )
-    start = Model.of(bench)
-    selection = Selection(start.refined({"torque"}), Screening(bench, start))
+    selection, bench = rippled, rippled.model.bench
     ripples = Search(selection.model, "torque", grammar._signals(selection.model))
     side = harmonic("gear_gain", 2.6, bench.middle, ripples.covered)
     [lobe] = ripples._run([side])
@@ -775,6 +781,86 @@ def test_a_term_that_its_limit_would_hold_is_not_taken(coupled):
     assert search.is_within(term)
     assert not search.is_within(msgspec.structs.replace(term, coefficient=30.0))
     assert search.is_within(msgspec.structs.replace(term, coefficient=0.3, other=None, other_high=0.0))
+
+
+def _filled(selection, terms, coefficient=1e-9):
+    """A selection whose calibration holds so many terms, those added next to nothing."""
+    bench = selection.model.bench
+    [*own] = bench.calibration.terms
+    more = {"port": "torque", "signal": "motor_speed", "shape": "constant", "low": -1e9, "high": 1e9}
+    own += [Term(name=f"term:{number}", coefficient=coefficient, **more) for number in range(len(own), terms)]
+    under = bench.under(msgspec.structs.replace(bench.calibration, terms=tuple(own)))
+    return dataclasses.replace(selection, model=dataclasses.replace(selection.model, bench=under))
+
+
+@pytest.fixture(scope="module")
+def full(rippled):
+    """As many terms as a calibration holds, the last of them the gear's ripple."""
+    start = _filled(rippled, MOST - 1)
+    search = Search(start.model, "torque", grammar._signals(start.model))
+    [ripple] = search._run([harmonic("gear_gain", 3.0, start.model.bench.middle, search.covered)])
+    effect = made_effect(ripple.form, grammar._name(ripple.form, start))
+    found = grammar._enter(start, Candidate(effect, "torque", evidence=ripple.evidence), ripple.form)
+    assert len(prospects.standing_terms(found.model)) == MOST and found.accepted == [effect.name]
+    return found
+
+
+def test_where_a_calibration_has_no_room_for_a_term_a_search_offers_none_and_that_is_said(full, monkeypatch):
+    search = Search(full.model, "torque", grammar._signals(full.model))
+    assert search.prospects() == [] and search.ripples() == [] and search.of_means("torque", ("motor_speed",)) == []
+    monkeypatch.setattr(grammar, "_wanted", lambda *_: True)
+    asked = grammar._with_terms(full, "torque")
+    assert asked.accepted == full.accepted and asked.full == {"torque"}
+    form = harmonic("torque", 3.0, full.model.bench.middle, search.covered)
+    candidate = Candidate(made_effect(form, "term:torque:motor_angle"), "torque")
+    assert "holds" in grammar._enter(full, candidate, form).candidates["term:torque:motor_angle"].reason
+    [told] = _full(SimpleNamespace(selection=asked))
+    assert told.startswith(f"No further term was looked for on the torque path: a calibration holds {MOST} terms")
+    assert _full(SimpleNamespace(selection=full)) == []
+
+
+def test_a_term_that_was_taken_out_again_takes_no_room(full, monkeypatch):
+    """A further one, and what is tried for a moment, stand in its place under another name."""
+    monkeypatch.setattr(model_module, "_FITS", 0)
+    [name] = full.accepted
+    bare = full.without(name, "to be made again")
+    assert prospects.free_place(full.model) is None and prospects.free_place(bare.model) == MOST - 1
+    search = Search(bare.model, "torque", grammar._signals(bare.model))
+    [ripple] = search._run([harmonic("gear_gain", 3.0, bare.model.bench.middle, search.covered)])
+    named = grammar._name(ripple.form, bare)
+    assert named == f"{name}:2"
+    again = Candidate(made_effect(ripple.form, named), "torque", evidence=ripple.evidence)
+    found = grammar._enter(bare, again, ripple.form)
+    assert found.accepted == [named] and found.model.bench.calibration.terms[-1].name == named
+    assert len(found.model.bench.calibration.terms) == MOST
+    assert found.model.noise("torque") == pytest.approx(full.model.noise("torque"), rel=0.05)
+
+
+def test_the_order_of_a_ripple_is_chosen_again_in_a_calibration_that_holds_no_further_term(full, monkeypatch):
+    """The search for it tries terms beside those that stand, of which the ripple is none for a moment."""
+    monkeypatch.setattr(model_module, "_FITS", 0)
+    again = grammar._with_orders_again(full, "torque")
+    assert len(again.accepted) == 1 and again.model.noise("torque") <= full.model.noise("torque")
+
+
+def test_a_calibration_with_the_four_terms_of_another_brake_has_room_for_more(rippled, full):
+    assert grammar._has_room(_filled(rippled, 4), "torque") and grammar._has_room(_filled(rippled, MOST - 3), "torque")
+    assert not grammar._has_room(_filled(rippled, MOST - 2), "torque"), "two are the heat's"
+    assert grammar._has_room(_filled(_filled(rippled, 4), MOST, 0.0), "torque"), "nor do those that were taken out again"
+    assert grammar._has_room(_filled(rippled, MOST - 2), "temperature")
+    assert not any(grammar._has_room(full, channel) for channel in ("torque", "temperature"))
+
+
+@pytest.mark.parametrize("clamps", [True, False])
+def test_of_a_brake_no_place_along_the_motor_angle_is_asked_for(clamps):
+    """The angle begins anywhere at each power-on: in the next log the term would act at another place."""
+    covered = {"motor_angle": (0.0, 40.0), "travel": (0.0, 20.0), "motor_speed": (-200.0, 200.0)}
+    bench = SimpleNamespace(clamps=clamps)
+    search = SimpleNamespace(covered=covered, ports=PORTS, model=SimpleNamespace(bench=bench))
+    forms = Search.forms.func(search)
+    assert any(form.signal == "motor_angle" for form in forms) is not clamps
+    assert any((form.signal, form.shape) == ("travel", "bump") for form in forms)
+    assert {*rippling(PORTS)} >= {"gear_gain", "torque"}, "ripples are no place"
 
 
 def test_a_term_beside_which_everything_else_says_the_same_is_not_applied(coupled, monkeypatch):

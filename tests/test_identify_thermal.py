@@ -13,8 +13,10 @@ from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import to_parameters
 from emb_daemon.diagnose import grammar
 from emb_daemon.diagnose.grammar import search_heat
+from emb_daemon.diagnose.model import Model
 from emb_daemon.diagnose.selection import Selection
-from emb_daemon.diagnose.warmth import HeatBench, HeatScreening
+from emb_daemon.diagnose.warmth import HeatBench, HeatScreening, HeatSearch
+from emb_daemon.effects.terms import MOST
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.identify.calibration import nominal
@@ -415,6 +417,21 @@ def test_a_term_is_wanted_for_half_a_kelvin_that_lasts_and_not_for_what_thermoco
     screening = HeatScreening(bench, model)
     assert 0.15 < screening.floor(model, "temperature", made=True) < np.sqrt(model.noise("temperature"))
     assert grammar._wanted(Selection(model, screening), "temperature") is wanted
+
+
+@pytest.mark.parametrize("standing", [MOST, MOST - 1])
+def test_a_heat_balance_is_searched_where_there_is_room_for_a_term(standing):
+    """A term of no size stands in for one that a search took out again."""
+    of = {"port": "torque", "signal": "motor_speed", "shape": "constant", "low": -1.0, "high": 1.0}
+    terms = tuple(Term(name=f"term:{n}", coefficient=1e-9 * (n < standing), **of) for n in range(MOST))
+    bench = HeatBench(_hidden(_bent(1.0), np.random.default_rng(5)), structs.replace(START, terms=terms))
+    search = HeatSearch(Model(bench, {}, *bench.run({})))
+    if standing == MOST:
+        assert search.prospects() == [] and search.dependence() == {} and search.of_means("pad_heat", ("disc_speed",)) == []
+    else:
+        alone = HeatSearch(Model(bare := bench.under(START), {}, *bare.run({})))
+        form = next(form for form in search.forms if form.means == ("disc_cooling", "disc_speed"))
+        assert np.any(search.answer(form)) and np.array_equal(search.answer(form), alone.answer(form))
 
 
 def test_the_residual_of_a_heat_fit_that_has_not_converged_is_no_term():

@@ -45,7 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     text = json.dumps(report(diagnosis), indent=1, ensure_ascii=False)
     write_atomically(arguments.output / "report.json", text.encode())
     write_atomically(arguments.output / "report.html", page(diagnosis).encode())
-    console = Console()
+    # Equations have square brackets and names of terms colons, which are no markup.
+    console = Console(markup=False, emoji=False)
     console.print(verdict(diagnosis))
     console.print(table(diagnosis))
     console.print(f"calibration, report.html and report.json are in {arguments.output}", highlight=False)

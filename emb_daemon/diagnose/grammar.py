@@ -7,6 +7,7 @@ best that all forms together do with their signals moved in time (maxima as Roma
 signal at another time, and whether resampled episodes would choose the same.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -28,6 +29,8 @@ from emb_daemon.diagnose.prospects import (
     Search,
     coordinate_of,
     description_length,
+    free_place,
+    standing_terms,
     with_term,
 )
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, HEAT_CHANNELS, UNITS
@@ -88,11 +91,15 @@ def _with_terms(selection: Selection, channel: str) -> Selection:
             # The force that heats the pads has changed: what is left of their heat must not look like another term.
             selection = replace(selection, model=selection.model.settled({*HEAT_CHANNELS, channel}))
         selection = _restated(selection, before, channel)
+    if not _has_room(selection, channel) and _wanted(selection, channel):
+        return replace(selection, full=selection.full | {channel})
     return selection
 
 
 def _has_room(selection: Selection, channel: str) -> bool:
-    of_heat = [HOOKS[term.port].channel == CHANNEL_OF_HEAT for term in selection.model.bench.calibration.terms]
+    of_heat = [HOOKS[term.port].channel == CHANNEL_OF_HEAT for term in standing_terms(selection.model).values()]
+    if len(of_heat) >= MOST:
+        return False
     if channel == CHANNEL_OF_HEAT:
         return sum(of_heat) < _OF_HEAT
     return len(of_heat) - sum(of_heat) < MOST - _OF_HEAT
@@ -212,6 +219,8 @@ def _with_heat_terms(selection: Selection) -> Selection:
     if bench is None:
         return selection
     found = search_heat(bench)
+    if found.full:
+        selection = replace(selection, full=selection.full | found.full)
     if not found.accepted:
         return selection.noted(found.candidates.values())
     terms = msgspec.structs.replace(model.bench.calibration, terms=found.model.bench.calibration.terms)
@@ -620,17 +629,19 @@ def _chosen(prospects: Sequence[Prospect], lengths: np.ndarray) -> dict[tuple[st
 
 def _name(form: Form, selection: Selection) -> str:
     name = ":".join(["term", form.port, *form.signals])
+    # Also those of terms that were taken out again: what became of them is told by name.
     taken = {term.name for term in selection.model.bench.calibration.terms}
-    return name if name not in taken else next(f"{name}:{n}" for n in range(2, MOST + 2) if f"{name}:{n}" not in taken)
+    taken |= {known for known, c in selection.candidates.items() if c.made and c.amplitudes}
+    return name if name not in taken else next(f"{name}:{n}" for n in itertools.count(2) if f"{name}:{n}" not in taken)
 
 
 def _enter(selection: Selection, candidate: Candidate, form: Form) -> Selection:
     """With a term, fitted with everything else; without it again if it then proves nothing."""
     before, channel, name = selection.model, candidate.channel, candidate.effect.name
-    index = len(before.bench.calibration.terms)
-    if index == MOST:
+    index = free_place(before)
+    if index is None:
         return selection.noted([replace(candidate, reason=f"a calibration holds {MOST} terms")])
-    bench = with_term(before.bench, form.term(name))
+    bench = with_term(before.bench, form.term(name), index)
     fields = ["coefficient", *(["sine"] if form.shape == "harmonic" else [])]
     amplitudes = [coordinate_of(index, channel, form, field, name) for field in fields]
     sizes = {coordinate_of(index, channel, form, field, name): getattr(form, field) for field in form.fitted}

@@ -20,7 +20,7 @@ from emb_daemon.diagnose.residuals import Bench, Probe
 from emb_daemon.diagnose.selection import NOT_OF_A_FREE_MOTOR
 from emb_daemon.diagnose.signals import OF_A_BRAKE
 from emb_daemon.effects.base import HOOKS, Effect, Harmonic, Parameter
-from emb_daemon.effects.terms import PARAMETERS, PORTS, SIGNALS, evaluate
+from emb_daemon.effects.terms import MOST, PARAMETERS, PORTS, SIGNALS, evaluate
 from emb_daemon.errors import InvalidValue
 
 #: Samples that are averaged for chance, which asks all forms a hundred times, and for whether anything slow is left.
@@ -129,7 +129,7 @@ class Prospect:
 
 
 class Search:
-    """All forms at the ports of one channel."""
+    """All forms at the ports of one channel; none where the calibration has no room for a term."""
 
     def __init__(self, model: Model, channel: str, signals: list[np.ndarray]):
         self.model = model
@@ -144,6 +144,7 @@ class Search:
             port
             for port in PORTS
             if port in FORMED
+            and free_place(model) is not None
             and model.bench.channel_of(HOOKS[port].channel) == channel
             and not (port == NOT_OF_A_FREE_MOTOR and model.bench.turns_free)
         )
@@ -152,9 +153,13 @@ class Search:
 
     @cached_property
     def forms(self) -> list[Form]:
-        """All of one signal but ripples. Where nothing is clamped neither direction is closing: friction is odd in speed."""
-        every = enumerate_forms(self.covered, self.ports)
-        return [form for form in every if form.gate == "always" or self.model.bench.clamps]
+        """All of one signal but ripples. Where nothing is clamped neither direction is closing: friction is odd in speed.
+
+        A brake's motor angle begins anywhere at each power-on, so that a place along it is another one in the next log; its
+        travel counts from the contact. A machine that clamps nothing has no contact, and only its angle."""
+        bench, every = self.model.bench, enumerate_forms(self.covered, self.ports)
+        directed = [form for form in every if form.gate == "always" or bench.clamps]
+        return [form for form in directed if not (_is_place(form) and bench.clamps)]
 
     @cached_property
     def gains(self) -> np.ndarray:
@@ -199,6 +204,8 @@ class Search:
     def prospects(self, floor: float = 0.0) -> list[Prospect]:
         """The best forms, through the estimator, with their sizes fitted; shortest description first. Of two signals only
         where one leaves more than ``floor`` (RMS, in the channel's unit) that lasts, and if the best is one of them."""
+        if not self.ports:
+            return []
         model, samples = self.model, LASTING[self.channel]
         noise = float(noise_left(model, self.channel, samples).sum())
         alone, least = float(model.left_out(self.channel, samples=samples).sum()) - noise, noise * self.screen.noise_scatter
@@ -303,16 +310,36 @@ def _sensitivity(model: Model, channel: str, port: str) -> np.ndarray:
 
 def _find_regressors(model: Model, channel: str, form: Form) -> list[np.ndarray]:
     """A form's regressors, by the estimator itself."""
-    index = len(model.bench.calibration.terms)
-    bench = with_term(model.bench, form.term())
+    index = free_place(model)
+    bench = with_term(model.bench, form.term(), index)
     own = [coordinate_of(index, channel, form, "coefficient", "")]
     if form.shape == "harmonic":
         own.append(coordinate_of(index, channel, form, "sine", ""))
     return bench.regressors(model.values, [Probe(c) for c in own], model.residual, model.heat)
 
 
-def with_term(bench: Bench, term: Term) -> Bench:
-    return bench.under(msgspec.structs.replace(bench.calibration, terms=(*bench.calibration.terms, term)))
+def standing_terms(model: Model) -> dict[int, Term]:
+    """Terms that do something, or that a fit moves, by place. One that was taken out again stays in the calibration of a
+    search with a coefficient of zero, so that coordinates keep their places."""
+    moved = {c.effect for c in model.values}
+    return {i: t for i, t in enumerate(model.bench.calibration.terms) if t.coefficient or t.sine or t.name in moved}
+
+
+def free_place(model: Model) -> int | None:
+    """Place in the calibration for one more term; None if there is none."""
+    standing = standing_terms(model)
+    return next((place for place in range(MOST) if place not in standing), None)
+
+
+def with_term(bench: Bench, term: Term, place: int) -> Bench:
+    """With a term at a free place."""
+    terms = bench.calibration.terms
+    return bench.under(msgspec.structs.replace(bench.calibration, terms=(*terms[:place], term, *terms[place + 1 :])))
+
+
+def _is_place(form: Form) -> bool:
+    """Whether a form acts at one place along the motor angle."""
+    return form.signal == "motor_angle" and form.shape == "bump"
 
 
 def coordinate_of(index: int, channel: str, form: Form, field: str, effect: str) -> Coordinate:

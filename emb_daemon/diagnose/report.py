@@ -43,6 +43,7 @@ def report(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "worse": [{"log": log, "rmse_before_N": first, "rmse_after_N": last} for log, first, last in diagnosis.worse],
         "plain": dict(zip(("rms_plain_N", "rms_after_N"), diagnosis.plain, strict=True)) if diagnosis.plain else None,
+        "no_room_for_a_term": sorted(diagnosis.selection.full),
         "outside_range": [place._asdict() for place in diagnosis.outside],
         "unexplained": _unexplained(diagnosis),
         "judged_residual": {

@@ -64,6 +64,8 @@ class Selection:
     instead: "Selection | None" = None  #: what was chosen out of the catalogue alone, where some of it gave way to terms
     #: What was chosen with a term that went because its path, refitted, is described more shortly without it.
     longer: "Selection | None" = None
+    #: Channels of which something is left that a term was not looked for, because the calibration has no room for another.
+    full: frozenset[str] = frozenset()
 
     @property
     def accepted(self) -> list[str]:

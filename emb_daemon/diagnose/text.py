@@ -9,7 +9,7 @@ from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.signals import MANOEUVRES
 from emb_daemon.diagnose.unexplained import is_beyond
-from emb_daemon.effects.terms import SIGNALS
+from emb_daemon.effects.terms import MOST, SIGNALS
 
 #: Where a term acts, for people.
 _PORTS = {
@@ -107,7 +107,9 @@ def verdict(diagnosis: Diagnosis) -> str:
         off = "; the calibration itself was off" if diagnosis.recalibrated else ""
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
-    parts = (_worse, _plain, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _stated)
+    parts = (
+        _worse, _plain, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _full, _stated,
+    )  # fmt: skip
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
 
@@ -248,6 +250,15 @@ def _unexplained(diagnosis: Diagnosis) -> list[str]:
         return [f"{text}, which depend on no signal that was recorded.", *_withdrawn(diagnosis, left.channel)]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
     return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}.", *_withdrawn(diagnosis, left.channel)]
+
+
+def _full(diagnosis: Diagnosis) -> list[str]:
+    """Where something is left that a term was not looked for."""
+    paths = [NAMES[channel] for channel in sorted(diagnosis.selection.full)]
+    told = (
+        f"No further term was looked for on the {' and the '.join(paths)}: a calibration holds {MOST} terms, two of the heat."
+    )
+    return [told] if paths else []
 
 
 def least_left(diagnosis: Diagnosis) -> str:

@@ -17,7 +17,7 @@ from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.diagnose.coordinates import Coordinate, Values, base_coordinates, scaled_coordinate
 from emb_daemon.diagnose.forms import FORMED, Form
 from emb_daemon.diagnose.model import Model
-from emb_daemon.diagnose.prospects import CHANCES, SHIFTS, Scores, Screen, Search, covered_by, record_of
+from emb_daemon.diagnose.prospects import CHANCES, SHIFTS, Scores, Screen, Search, covered_by, free_place, record_of
 from emb_daemon.diagnose.residuals import CHANNEL_OF_HEAT, SIDE_BY_SIDE, Bench, count_over
 from emb_daemon.diagnose.screening import Rivals, Screening, risen_K
 from emb_daemon.effects.base import HOOKS
@@ -122,7 +122,9 @@ class HeatSearch(Search):
         self.signals: list[np.ndarray] = model.bench.signals(model.values)
         self.random: np.random.Generator = np.random.default_rng(0)
         self.covered: dict[str, tuple[float, float]] = covered_by(np.concatenate(self.signals))
-        self.ports: tuple[str, ...] = tuple(p for p in PORTS if p in FORMED and HOOKS[p].channel == CHANNEL_OF_HEAT)
+        self._place: int | None = free_place(model)
+        ports = PORTS if self._place is not None else ()
+        self.ports: tuple[str, ...] = tuple(p for p in ports if p in FORMED and HOOKS[p].channel == CHANNEL_OF_HEAT)
         self.screen: Screen = Screen(model, CHANNEL_OF_HEAT, 1)
         self._parameters = to_parameters(model.bench.calibrated(model.values))
         self._answers: dict[Form, np.ndarray] = {}
@@ -130,9 +132,9 @@ class HeatSearch(Search):
     def answer(self, form: Form) -> np.ndarray:
         own = self._parameters.copy()
         terms = own["effects"]["terms"]
-        terms["term"][terms["count"]] = record_of(form)
-        terms["term"]["coefficient"][terms["count"]] = form.step
-        terms["count"] += 1
+        terms["term"][self._place] = record_of(form)
+        terms["term"]["coefficient"][self._place] = form.step
+        terms["count"] = max(terms["count"], self._place + 1)
         return (self.model.residual[CHANNEL_OF_HEAT] - self.model.bench.residual_of(own)) / form.step
 
     def _answers_of(self, forms: Sequence[Form]) -> np.ndarray:
@@ -142,7 +144,7 @@ class HeatSearch(Search):
         return np.column_stack([self._answers[form] for form in forms])
 
     def _find_gains(self, forms: Sequence[Form]) -> np.ndarray:
-        return self.screen.scores(self._answers_of(forms)).gain
+        return self.screen.scores(self._answers_of(forms)).gain if forms else np.zeros(0)
 
     def _move_in_time(self, columns: np.ndarray, low: float, high: float) -> np.ndarray:
         """Columns at another time, as if the recordings were a circle: a share between two of them later."""
@@ -165,6 +167,8 @@ class HeatSearch(Search):
 
     def dependence(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Squared error of each left-out episode, without and with the best form of each signal."""
+        if not self.forms:
+            return {}
         plain = self.model.left_out(CHANNEL_OF_HEAT)
         scores, gains = self.screen.scores(self._answers_of(self.forms)), self.gains
         found = {}

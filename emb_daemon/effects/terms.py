@@ -12,8 +12,9 @@ import numpy as np
 from emb_daemon.jit import Floats, Record, fields, hypot, njit, sq
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
-#: Largest number of terms in a calibration.
-MOST = 6
+#: Largest number of terms in a calibration. One costs at most 30 ns in a step, and a brake of other physics than the
+#: calibration's takes four before anything is diagnosed, which must leave room for more.
+MOST = 12
 
 #: Ports: hooks of `effects.base.HOOKS` to which a term may add, in its unit.
 PORTS = (
