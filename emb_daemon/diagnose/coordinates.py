@@ -158,8 +158,8 @@ def base_coordinates(calibration: Calibration, clearances_rad: Sequence[float], 
             result.append(scaled_coordinate(calibration, keys, "stiffness", _CURVE))
     for name in ("per_K", "history_per_K"):
         known = parameter(calibration, f"thermal.softening.{name}")
-        # A softening of about nothing was never identified: its prior is the usual size.
-        prior = max(abs(known.value) / 3.0, _SOFTENING) if is_identified(calibration, known.key) else _usual(known.step)
+        # A softening of zero was never identified: its prior is the usual size.
+        prior = max(abs(known.value) / 3.0, _SOFTENING) if known.value else _usual(known.step)
         move = (Move(known.key, 1.0, 0.0, _MOST_SOFTENING),)
         low, high = min(0.0, known.value), max(_MOST_SOFTENING, known.value)
         result.append(Coordinate(known.key, "stiffness", known.value, known.step, prior, move, low, high, known.unit))
@@ -194,7 +194,7 @@ def _usual(step: float) -> float:
     return 1e3 * step
 
 
-def is_identified(calibration: Calibration, key: str) -> bool:
+def _is_identified(calibration: Calibration, key: str) -> bool:
     """Whether a base parameter is clear of zero, by the standard deviation that its calibration states: a fit leaves about
     nothing of what its logs do not show."""
     sigmas = calibration.provenance.sigmas if calibration.provenance else {}
@@ -208,7 +208,7 @@ def tolerated(calibration: Calibration, name: str) -> float:
     if name not in TOLERATED or not calibration.provenance:
         return np.inf
     # The pads' friction is a factor of its table, which has a size.
-    return TOLERATED[name] if name == PAD_FRICTION or is_identified(calibration, name) else np.inf
+    return TOLERATED[name] if name == PAD_FRICTION or _is_identified(calibration, name) else np.inf
 
 
 def _friction(calibration: Calibration) -> list[Coordinate]:
