@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 from diagnosekit import drives
@@ -11,7 +12,7 @@ from diagnosekit import drives
 from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
 from emb_daemon.diagnose import confirmation, diagnosis, grammar, search
 from emb_daemon.diagnose.comparison import episodes_by_log
-from emb_daemon.diagnose.coordinates import TOLERATED
+from emb_daemon.diagnose.coordinates import PAD_FRICTION, TOLERATED, tolerated
 from emb_daemon.diagnose.diagnosis import Recalibrated, diagnose
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.page import page
@@ -69,6 +70,15 @@ def test_an_effect_is_not_hidden_by_a_calibration_that_is_off(calibration, visco
     assert not constant["tolerance"] and load["tolerance"]
     assert "No tolerance: torque constant" in verdict(result) and "load → " not in verdict(result).partition("No tol")[2]
     assert "no tolerance: more than a factor of 1.02" in page(result)
+
+
+@pytest.mark.parametrize(("value", "sigma", "identified"), [(2.8e-7, 5e-4, False), (2.8e-4, 3e-5, True), (0.0, 3e-5, False)])
+def test_a_softening_that_no_log_has_shown_has_no_tolerance(calibration, value, sigma, identified):
+    """It may be any: a fit of logs without heat leaves it at about nothing."""
+    key = "thermal.softening.per_K"
+    provenance = msgspec.structs.replace(calibration.provenance, sigmas={key: sigma})
+    known = msgspec.structs.replace(moved(calibration, {key: value}), provenance=provenance)
+    assert tolerated(known, key) == (2.0 if identified else np.inf) and tolerated(known, PAD_FRICTION) == 2.0
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,22 @@ from studies.drives import rig_stop
 from studies.strangers import draw_brake
 
 
+def _of(*left, bench):
+    """A diagnosis of which so much is left, most of the first."""
+    by_channel = {one.channel: one for one in left}
+    return SimpleNamespace(unexplained=left[0], left=by_channel, bench=bench, findings=(), withdrawn=())
+
+
+def test_what_is_left_of_each_path_is_said_and_not_only_what_depends_on_a_signal():
+    bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=object()))
+    torque = Left("torque", 140.0, 120.0, 0.4, (Dependence("torque", "motor_speed", 0.11, 46.5, 4.0, True),))
+    stiffness = Left("stiffness", 67.7, 50.0, 0.5, (Dependence("stiffness", "energy", 0.2, 30.0, 4.0, True),))
+    nothing = Left("temperature", 2.0, 3.0, 1.0, ())
+    first, second = _unexplained(_of(torque, nothing, stiffness, bench=bench))
+    assert "140 N RMS of the torque path, where 120 N are what" in first and "on motor speed (by 46.5 N). What would" in first
+    assert second.startswith("Nor explained") and "67.7 N RMS of the stiffness path" in second and "energy (by 30 N)" in second
+
+
 def test_there_is_a_manoeuvre_for_every_signal():
     assert set(MANOEUVRES) >= {*SIGNALS, "motor_acceleration", "disc_angle"}
 
@@ -146,7 +162,7 @@ def test_what_is_left_in_one_stop_of_forty_is_said_where_it_is_beyond_chance_and
         assert at_s == pytest.approx(17.5 * length * CYCLE_S, rel=1e-3)
         left = Left("stiffness", last, known, 0.25, (Dependence("stiffness", "energy", 0.1, 4.0, 1.0, False),), log, at_s)
         bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=object()))
-        [told] = _unexplained(SimpleNamespace(unexplained=left, bench=bench, findings=(), withdrawn=()))
+        [told] = _unexplained(_of(left, bench=bench))
         assert left.beyond and "on one.log at 140 s" in told and "energy" not in told
 
 
@@ -171,7 +187,7 @@ def test_a_term_that_leaves_clearly_more_of_other_logs_than_of_the_fitted_ones_i
     assert left.present is said
     if said:
         bench = SimpleNamespace(own_data=False, calibration=SimpleNamespace(provenance=object()))
-        [told] = _unexplained(SimpleNamespace(unexplained=left, bench=bench, findings=(), withdrawn=()))
+        [told] = _unexplained(_of(left, bench=bench))
         assert "26 N RMS" in told and "16.5 N are left of the logs in which" in told and "energy" not in told
 
 

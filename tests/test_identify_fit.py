@@ -40,6 +40,7 @@ from emb_daemon.identify.steps import attribution, contact, noise, stiffness, to
 from emb_daemon.identify.steps.held_out import Fold
 from emb_daemon.identify.steps.thickness import ThicknessStep, left_out_errors
 from emb_daemon.identify.steps.torque import KEYS, TorqueFit, Unexplained, fit_torque, unexplained_current
+from emb_daemon.identify.validation import why_worse
 from emb_daemon.offline import log_of
 from emb_daemon.offline.run import held, run_step
 from emb_daemon.offline.score import rmse
@@ -479,3 +480,9 @@ def test_a_single_curve_is_unsure_of_other_pads_by_how_compliance_may_grow():
     parts = np.linspace(0.0, 0.5, 1001)
     assert only.interpolation_error(12.0) == pytest.approx(np.sqrt(np.mean(parts**2)), rel=1e-3)
     assert only.interpolation_error(4.0) == pytest.approx(only.interpolation_error(12.0))
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.898, "89.8"), (0.8999, "89.9"), (0.893, "89"), (0.7, "70"), (0.9, None)])
+def test_a_share_that_is_too_small_is_told_with_digits_that_say_so(share, told):
+    lines = why_worse([SimpleNamespace(name="random", figures={"inside_two_sigma": share})])
+    assert [line.partition(" % of")[0] for line in lines] == ([f"random: {told}"] if told else [])

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,12 +21,12 @@ from emb_daemon.effects.terms import MOST
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.records import SAMPLE, new_state
 from emb_daemon.identify.calibration import nominal
-from emb_daemon.identify.steps import thermal
+from emb_daemon.identify.steps import Step, thermal
 from emb_daemon.identify.steps.cooling import cooling_law
 from emb_daemon.identify.steps.friction import fit_friction
 from emb_daemon.identify.steps.heat import UNKNOWNS, check_excitation, fit_heat
 from emb_daemon.identify.steps.softening import fit_softening
-from emb_daemon.identify.steps.thermal import find_terms
+from emb_daemon.identify.steps.thermal import ThermalStep, find_terms
 from emb_daemon.jit import njit
 from emb_daemon.logs.mapping import Mapping
 from emb_daemon.models.thermal import friction_power
@@ -150,8 +151,8 @@ def _unexcited(fit):
     return {note.partition(":")[0] for note in fit.notes}
 
 
-def _disc_alone(truth, scenario, folder, name):
-    """What `recording` makes of a table of speed, brake torque and the disc's temperature that begins when it is warm."""
+def _disc_log(truth, scenario, folder, name):
+    """A log of a table of speed, brake torque and the disc's temperature that begins when it is warm."""
     r, _ = run_plant(truth, *scenario, 0.25, np.random.default_rng(3), name)
     begins = len(r.power) // 4
     columns = (r.time_s, r.speed, np.divide(r.power, r.speed, where=r.speed > 0.0, out=np.zeros(len(r.power))))
@@ -164,7 +165,45 @@ def _disc_alone(truth, scenario, folder, name):
         f"  VEH_Status.AmbientTemp: {{value: {AMBIENT_C}}}\n  RIG_FL_Force.DiscTempRef: {{signal: disc, unit: degC}}\n"
         "  RIG_FL_Force.ClampForceRef: {signal: force, unit: N}\n  RIG_FL_Force.BrakeTorqueRef: {signal: torque, unit: N·m}\n"
     )
-    return recording(load_log(folder / f"{name}.csv", read=Mapping(folder / "mapping.yaml").read))
+    return load_log(folder / f"{name}.csv", read=Mapping(folder / "mapping.yaml").read)
+
+
+def _disc_alone(*of_what):
+    return recording(_disc_log(*of_what))
+
+
+def test_no_heat_is_identified_of_a_brake_torque_whose_number_was_full(tmp_path):
+    """16 bits, in steps of 0.1 N·m."""
+    log = _disc_log(to_parameters(START), _drag(420.0), tmp_path, "drag")
+    share = np.abs(np.sin(1e-9 * (log.reference.time_ns - log.time_ns[0])))
+    for within in (3270.0 * share, 2500.0 * np.sign(share - 0.5)):
+        log.reference.brake_torque_Nm = within
+        recording(log)
+    log.reference.brake_torque_Nm = (3600.0 * share + 3276.8) % 6553.6 - 3276.8
+    with pytest.raises(InputError, match=r"drag\.csv: the reference brake torque goes from .* at once: its number"):
+        recording(log)
+
+
+def _validated(figures, fitted_K):
+    """What is said, and what the calibration states, of a step with these figures on unseen logs."""
+    campaign, said = SimpleNamespace(), []
+    campaign.fault = said.append
+    calibration = moved(START, {"thermal.sigma_K": fitted_K})
+    step = ThermalStep(values={"thermal.sigma_K": fitted_K}, fitted={}, unseen={"validate": None}, heat=Step())
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(thermal, "_validate", lambda *_: ({}, {f"validate: {key}, K": k for key, k in figures.items()}, {}))
+        step = thermal.validate(campaign, step, calibration)
+    return said, moved(calibration, thermal.stated(step, calibration)).thermal.sigma_K
+
+
+def test_sigma_of_temperatures_is_what_validation_shows_as_in_a_car():
+    """Both by campaigns: of the first the heat is another on the log that validates, of the second the force is."""
+    known, unknown, in_car = "pads, torque known", "pads, no torque", "pads, no torque, estimated force"
+    said, sigma_K = _validated({known: 40.9, "disc, no torque": 26.8, unknown: 43.7, in_car: 47.3}, 3.14)
+    assert sigma_K == 47.3 and len(said) == 1 and "off by 43.7 K" in said[0] and "47.3 K as in a car" in said[0]
+    assert _validated({known: 0.42, "disc, no torque": 2.4, unknown: 0.49, in_car: 1.964}, 0.504) == ([], 1.964)
+    assert _validated({known: 0.42, unknown: 0.49, in_car: 0.45}, 0.504) == ([], 0.504)
+    assert _validated({"disc, no torque": 9.0}, 0.504) == ([], 0.504)
 
 
 def test_a_disc_that_was_measured_alone_gives_the_disc_alone(tmp_path):

@@ -294,7 +294,8 @@ class Thermal(Struct, kw_only=True):
     disc: Disc
     friction: FrictionTable
     softening: Softening
-    #: Standard deviation of the modelled pad temperatures.
+    #: Standard deviation of the modelled pad temperatures. `identify` states what its fitted logs leave, or what the logs that
+    #: validate show as in a car, if that is more.
     sigma_K: Positive = 5.0
 
 

@@ -94,6 +94,10 @@ _BASE = (
     ("thermal.disc.cooling_W_per_K", "temperature", 0.5),
     ("thermal.disc.cooling_per_speed_J_per_rad_K", "temperature", 0.5),
 )
+#: The pads' friction as a whole, as a factor.
+PAD_FRICTION = "thermal.friction.coefficient"
+#: Standard deviations from zero from which a parameter was identified.
+_CLEAR_OF_ZERO = 2.0
 #: Factor by which units, wear and temperature change a parameter at most that was identified; beyond it something else looks
 #: like it. Torque constant: suppliers grant a tenth, and 80 K more take as much from magnets (0.12 %/K). Inertia: masses stay
 #: what they are, datasheets grant 15 %. Friction: greased screws have a coefficient of 0.05 to 0.2, about 0.1, and grease in
@@ -104,7 +108,7 @@ TOLERATED: dict[str, float] = {
     INERTIA: 1.15,
     LOAD_FRICTION: 2.0,
     OFFSET_FRICTION: 4.0,
-    "thermal.friction.coefficient": 2.0,
+    PAD_FRICTION: 2.0,
     "thermal.softening.per_K": 2.0,
     "thermal.softening.history_per_K": 2.0,
     "thermal.disc.heat_capacity_J_per_K": 1.25,
@@ -190,6 +194,23 @@ def _usual(step: float) -> float:
     return 1e3 * step
 
 
+def _is_identified(calibration: Calibration, key: str) -> bool:
+    """Whether a base parameter is clear of zero, by the standard deviation that its calibration states: a fit leaves about
+    nothing of what its logs do not show."""
+    sigmas = calibration.provenance.sigmas if calibration.provenance else {}
+    value = value_of(calibration, key)
+    return value != 0.0 and abs(value) >= _CLEAR_OF_ZERO * sigmas.get(key, 0.0)
+
+
+def tolerated(calibration: Calibration, name: str) -> float:
+    """The factor by which a base parameter changes at most; infinite for what a supplier or nobody has stated, or no log has
+    shown, which may be off by anything."""
+    if name not in TOLERATED or not calibration.provenance:
+        return np.inf
+    # The pads' friction is a factor of its table, which has a size.
+    return TOLERATED[name] if name == PAD_FRICTION or _is_identified(calibration, name) else np.inf
+
+
 def _friction(calibration: Calibration) -> list[Coordinate]:
     """The pads' friction table as a whole, and its slopes over force and disc speed."""
     table = calibration.thermal.friction
@@ -207,7 +228,7 @@ def _friction(calibration: Calibration) -> list[Coordinate]:
             for i, j, k in np.ndindex(coefficient.shape)
         )
         low = _LEAST if start else -np.inf
-        result.append(Coordinate(f"thermal.friction.coefficient{name}", "brake_torque", start, 1e-3, prior, moves, low))
+        result.append(Coordinate(f"{PAD_FRICTION}{name}", "brake_torque", start, 1e-3, prior, moves, low))
     return result
 
 

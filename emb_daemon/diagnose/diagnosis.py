@@ -18,7 +18,7 @@ from emb_daemon.calibration.terms import REMEMBERING, Term
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
 from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, left_out_residuals, quarters, validation_gains
-from emb_daemon.diagnose.coordinates import TOLERATED, Coordinate, about_middle, by_key
+from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key, tolerated
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.late_reference import may_be_late, reference_late_s
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
@@ -389,9 +389,9 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
             if abs(value - before) < _MOVED * sigma and gain < selection.screening.floor(model, c.channel):
                 continue
             key = c.name if c.log is None or len(model.bench.trials) == 1 else f"{c.name} (log {c.log + 1})"
-            # What a supplier or nobody has stated may be off by anything.
-            tolerated = TOLERATED.get(c.name, np.inf) if before and calibration.provenance else np.inf
-            result[key] = Recalibrated(before, float(value), float(sigma), unit, gain, c.channel, tolerated)
+            result[key] = Recalibrated(
+                before, float(value), float(sigma), unit, gain, c.channel, tolerated(calibration, c.name)
+            )
     return result
 
 

@@ -8,7 +8,7 @@ from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
 from emb_daemon.diagnose.screening import Candidate
 from emb_daemon.diagnose.signals import MANOEUVRES
-from emb_daemon.diagnose.unexplained import is_beyond
+from emb_daemon.diagnose.unexplained import Left, is_beyond
 from emb_daemon.effects.terms import MOST, SIGNALS
 
 #: Where a term acts, for people.
@@ -231,25 +231,30 @@ def _no_tolerance(diagnosis: Diagnosis) -> list[str]:
 
 
 def _unexplained(diagnosis: Diagnosis) -> list[str]:
-    left = diagnosis.unexplained
-    if left is None:
+    """What is left of each path on which something is, most of what the calibration achieved first."""
+    most = diagnosis.unexplained
+    if most is None:
         return []
+    others = [left for left in diagnosis.left.values() if left.present and left is not most]
+    return [told for left in (most, *others) for told in _left(diagnosis, left, "Not" if left is most else "Nor")]
+
+
+def _left(diagnosis: Diagnosis, left: Left, begin: str) -> list[str]:
     unit, strongest, on = UNITS[left.channel], left.strongest, f" on {left.place}" if left.log else ""
-    if left.beyond:
-        size = f"{left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}"
-        known = f"{left.achieved:.3g} {unit} are {least_left(diagnosis)}"
-        if not is_beyond(left.rms, left.achieved):
-            known = f"{left.fitted:.3g} {unit} are left of the logs in which a term was made for it"
-        text = f"Not explained by any known effect: {size}, where {known}"
-    else:
-        text = f"Not explained by any known effect: {strongest.rms:.3g} {unit} RMS of the {NAMES[left.channel]}"
+    text = f"{begin} explained by any known effect: {left.rms:.3g} {unit} RMS of the {NAMES[left.channel]}{on}"
+    if left.beyond and not is_beyond(left.rms, left.achieved):
+        text += f", where {left.fitted:.3g} {unit} are left of the logs in which a term was made for it"
+    elif np.isfinite(left.achieved):
+        text += f", where {left.achieved:.3g} {unit} are {least_left(diagnosis)}"
+    withdrawn = _withdrawn(diagnosis, left.channel)
     if strongest is None and left.elsewhere:
-        told = f"{text}. What would tell: more such manoeuvres in the logs that are fitted."
-        return [told, *_withdrawn(diagnosis, left.channel)]
+        return [f"{text}. What would tell: more such manoeuvres in the logs that are fitted.", *withdrawn]
     if strongest is None:
-        return [f"{text}, which depend on no signal that was recorded.", *_withdrawn(diagnosis, left.channel)]
+        return [f"{text}, which depend on no signal that was recorded.", *withdrawn]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
-    return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}.", *_withdrawn(diagnosis, left.channel)]
+    if not left.beyond:
+        told += f" (by {strongest.rms:.3g} {unit})"
+    return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}.", *withdrawn]
 
 
 def _full(diagnosis: Diagnosis) -> list[str]:

@@ -55,7 +55,7 @@ class ThermalLogs(Struct, kw_only=True):
 
     #: About 3 kN, with the disc's speed as a slow sinusoid: for the heat paths of pads and disc.
     tune: str | None = None
-    #: Stops and pauses, on which the heat model is judged.
+    #: Stops and pauses, on which the heat model is judged; the calibration's `sigma_K` is at least what it shows.
     validate: str | None = None
     #: A grid of clamp forces and disc speeds at rising temperature: for the friction coefficient.
     heat_flux_map: str | None = None

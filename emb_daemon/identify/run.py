@@ -79,12 +79,14 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     levels = noise.identify(campaign, stiff, motor, folds, interpolation, found)
     calibration = tidy(moved(found.calibration, levels.values))
     heat = thermal.validate(campaign, heat, calibration)
+    unsure = thermal.stated(heat, calibration)
+    calibration = moved(calibration, unsure)
     validations = []
     for fold in folds:
         # Noise levels, too, come from other pads than those that judge them.
         others = [other for other in folds if other is not fold] or [fold]
         mine = noise.identify(campaign, stiff, motor, others, interpolation)
-        there, name = moved(found.without(fold), mine.values), f"random, {fold.pads.thickness_mm:g} mm"
+        there, name = moved(found.without(fold), mine.values | unsure), f"random, {fold.pads.thickness_mm:g} mm"
         validations += [validate(name, "random", log, there) for log in fold.held_out]
     validations += validate_others(campaign, calibration, thick, motor)
     for fault in why_worse(validations or validate_fitted(stiff.pads, calibration, thick)):

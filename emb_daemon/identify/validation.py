@@ -97,11 +97,17 @@ def validate_fitted(groups: list[Pads], calibration: Calibration, thickness: Thi
     ]
 
 
+def _below(share: float, least: float) -> str:
+    """A share in per cent, with digits enough to be below ``least``; never rounded up to that."""
+    text = f"{100 * share:.0f}"
+    return text if float(text) < 100 * least else f"{np.floor(1000 * share) / 10:.1f}"
+
+
 def why_worse(validations: list[Validation]) -> list[str]:
     """A line for each log that shows the calibration to be worse than it says."""
     return [
-        f"{one.name}: {100 * share:.0f} % of the errors inside two sigma, expected {100 * _LEAST_INSIDE:.0f} % or more: the "
-        "calibration is worse than it says"
+        f"{one.name}: {_below(share, _LEAST_INSIDE)} % of the errors inside two sigma, expected {100 * _LEAST_INSIDE:.0f} % "
+        "or more: the calibration is worse than it says"
         for one in validations
         if (share := one.figures["inside_two_sigma"]) < _LEAST_INSIDE
     ]

@@ -32,6 +32,10 @@ from emb_daemon.report.page import Page
 
 #: Pads are not known better than their thermocouples, K.
 _LEAST_SIGMA_K = 0.3
+#: Figures, by the log's name and what of the brake: with the rig's brake torque, without it, and as in a car, where the force
+#: is estimated, too.
+_TORQUE_KNOWN, _NO_TORQUE = "{}: {}, torque known, K", "{}: {}, no torque, K"
+_IN_CAR = "{}: pads, no torque, estimated force, K"
 _NEEDED = {
     "tune": "braking with thermocouples in the pads, for conductivity, specific heat and heat shares",
     "heat_flux_map": "braking at several forces and disc speeds, for friction over force, speed and temperature",
@@ -74,6 +78,7 @@ class ThermalStep(Step):
     #: RMSE on logs that were not fitted, by name with unit, once `validate`d.
     figures: dict[str, float] = field(default_factory=dict)
     achieved_K: float | None = None  #: the worst of these temperatures; None without one
+    in_car_K: float = 0.0  #: the worst of pads as in a car; zero without one
     residuals: dict[str, float] = field(default_factory=dict)  #: the same for what was fitted
 
 
@@ -166,18 +171,35 @@ def words(step: ThermalStep) -> str:
 
 
 def validate(campaign: Campaign, step: ThermalStep, calibration: Calibration) -> ThermalStep:
-    """The step with the accuracy of a calibration."""
+    """The step with the accuracy of a calibration; says where that is clearly less than on the logs that fitted."""
     if step.heat is None:
         return step
     temperatures, figures, residuals = _validate(campaign, step.fitted, step.unseen, calibration)
     achieved_K = max(figures.values(), default=None)
+    in_car_K = max((figures[key] for name in step.unseen if (key := _IN_CAR.format(name)) in figures), default=0.0)
+    for name in step.unseen:
+        unseen_K, fitted_K = figures.get(_NO_TORQUE.format(name, "pads"), 0.0), step.values.get("thermal.sigma_K", np.inf)
+        if is_beyond(unseen_K, fitted_K):
+            campaign.fault(
+                f"thermal: {name}: the pads' temperatures are off by {unseen_K:.3g} K RMS without the brake torque, and by "
+                f"{figures[_IN_CAR.format(name)]:.3g} K as in a car, which sigma_K holds, where the logs that fitted leave "
+                f"{fitted_K:.3g} K: beyond these, pads and disc are not as identified"
+            )
     if step.softening:
         figures |= step.softening.figures()
     if step.friction:
         residuals["friction coefficient, weighted by force"] = step.friction.rms
     if law := step.law:
         residuals["disc cooling rate, line over speed, 1/s"] = rmse(law(law.speed_rad_per_s) - law.rate_per_s)
-    return replace(step, temperatures=temperatures, figures=figures, achieved_K=achieved_K, residuals=residuals)
+    found = {"achieved_K": achieved_K, "in_car_K": in_car_K, "residuals": residuals}
+    return replace(step, temperatures=temperatures, figures=figures, **found)
+
+
+def stated(step: ThermalStep, calibration: Calibration) -> dict[str, float]:
+    """The standard deviation of the pads' temperatures, where validation as in a car shows more than the calibration states:
+    logs that fitted tell least of what the heat does elsewhere."""
+    more = step.in_car_K > calibration.thermal.sigma_K
+    return {"thermal.sigma_K": rounded(step.in_car_K, 4)} if more else {}
 
 
 def _logs(campaign: Campaign) -> tuple[dict[str, Log], dict[str, Log]]:
@@ -221,23 +243,23 @@ def _validate(campaign, recordings, unseen: dict[str, Log], calibration: Calibra
         if r is not None:
             temperatures[name] = _compare(name, r, parameters, figures)
             if r.has_pads:
-                figures[f"{name}: pads, no torque, estimated force, K"] = _as_in_a_car(log, calibration)
+                figures[_IN_CAR.format(name)] = _as_in_a_car(log, calibration)
     for name, r in recordings.items():
-        _note_errors(f"{name}: {{}}, torque known, K", _errors(parameters, r), residuals)
+        _note_errors(_TORQUE_KNOWN, name, _errors(parameters, r), residuals)
     return temperatures, figures, residuals
 
 
-def _note_errors(name: str, error: np.ndarray, into: dict[str, float]) -> None:
+def _note_errors(figure: str, name: str, error: np.ndarray, into: dict[str, float]) -> None:
     for part, rows in (("pads", error[:8]), ("disc", error[8])):
         if np.isfinite(rows).any():
-            into[name.format(part)] = rmse(rows)
+            into[figure.format(name, part)] = rmse(rows)
 
 
 def _compare(name: str, r: Recording, parameters: np.ndarray, into: dict[str, float]) -> Temperatures:
     every, found = max(round(0.5 / r.step_s), 1), []
-    for torque_known, words in ((True, "torque known"), (False, "no torque")):
+    for torque_known, figure in ((True, _TORQUE_KNOWN), (False, _NO_TORQUE)):
         error = _errors(parameters, r, torque_known)
-        _note_errors(f"{name}: {{}}, {words}, K", error, into)
+        _note_errors(figure, name, error, into)
         found.append((error + r.measured)[:, ::every])
     return Temperatures(r.time_s[::every], r.measured[:, ::every], *found)
 
