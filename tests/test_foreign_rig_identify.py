@@ -252,7 +252,7 @@ def test_a_drive_shows_friction_that_slow_motion_hides(tmp_path, capsys, monkeyp
     _overconfident(monkeypatch)
     monkeypatch.setattr(attribution, "identify", lambda _, hot, known, progress: attribution._unsearched(hot, known))
     main(["identify", str(tmp_path / "campaign.yaml"), "--output", str(output)])
-    assert re.search(r"judge: \d+ % of the errors inside two sigma, .* worse than it says", capsys.readouterr().err)
+    assert re.search(r"judge: [\d.]+ % of the errors inside two sigma, .* worse than it says", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("rate_Hz", [50.0, 20.0])
