@@ -65,7 +65,7 @@ def test_a_motor_that_gains_speed_needs_as_much_more_as_its_inertia_takes(p, s, 
 def test_the_noise_of_a_torque_is_that_of_both_speeds_and_of_what_is_apart_in_time(p, s, m):
     """Current and angle by a third of a cycle, and by the age of the angle; the inverse of a filter adds (1 + n)² + n² - 1 of
     the current's variance."""
-    s["speed_sigma"], s["had_current"] = 0.5, False
+    s["speed_sigma"], s["current_sigma"], s["had_current"] = 0.5, p["current_sigma"], False
     of_speed = 2.0 * (p["inertia"] * 0.5 / CYCLE_S) ** 2
     assert fuse._moving_variance(s, p, m) == pytest.approx(of_speed)
     s["had_current"], s["current_before"], m["current_q"], s["late"] = True, 4.0, 9.0, 0.006

@@ -176,8 +176,8 @@ STATE = np.dtype(
         ("gain", "f8", (STATES,)),
         *fields("f8", "current_before current_change wanted"),
         ("had_current", "?"),
-        # Noise of the speed, rad/s, and of the current, A: mean square of a motor that stands, and the larger of that and the
-        # calibration's.
+        # Noise of the speed, rad/s, and of the current, A: mean square of a motor that stands, and what is believed: of the
+        # speed the larger of that and the calibration's, of the current the latter unless the first is clearly larger.
         *fields("f8", "speed_square speed_sigma current_square current_sigma"),
         ("no_current_s", "f8"),
         ("trusted", "?"),

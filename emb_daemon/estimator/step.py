@@ -93,6 +93,9 @@ _LED = 0.2
 _HELD, _NOISE_S = 25, 0.5
 #: Standard deviations of the current's noise up to which a change counts as noise.
 _STEP = 5.0
+#: Factor on the calibration's noise of the current from which it is another: three standard deviations of what so few samples
+#: tell.
+_NOISIER = 1.25
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
 #: Standard deviations within which a stiffness is at its bound.
@@ -363,7 +366,8 @@ def _follow_noise(s, p, m):
             doubt_friction(s, m.angle)
             forget_level(s.contact)
     s.speed_sigma = max(sqrt(s.speed_square), p.speed_sigma)
-    s.current_sigma = max(sqrt(s.current_square), p.current_sigma)
+    noisy = s.current_square > sq(_NOISIER * p.current_sigma)
+    s.current_sigma = sqrt(s.current_square) if noisy else p.current_sigma
 
 
 @njit
