@@ -857,7 +857,9 @@ def test_of_a_brake_no_place_along_the_motor_angle_is_asked_for(clamps):
     covered = {"motor_angle": (0.0, 40.0), "travel": (0.0, 20.0), "motor_speed": (-200.0, 200.0)}
     bench = SimpleNamespace(clamps=clamps)
     search = SimpleNamespace(covered=covered, ports=PORTS, model=SimpleNamespace(bench=bench))
-    forms = Search.forms.func(search)
+    search.forms = Search.forms.func(search)
+    assert any(form.signal == "motor_angle" for form in search.forms), "chance may do what no term may"
+    forms = [search.forms[i] for i in Search._lasting(search, range(len(search.forms)))]
     assert any(form.signal == "motor_angle" for form in forms) is not clamps
     assert any((form.signal, form.shape) == ("travel", "bump") for form in forms)
     assert {*rippling(PORTS)} >= {"gear_gain", "torque"}, "ripples are no place"

@@ -1,7 +1,7 @@
 """Which forms of the grammar are worth a fit: screened on episodes left out of it, beside all that a path's own parameters can
 do, and the best few run through the estimator."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -153,13 +153,9 @@ class Search:
 
     @cached_property
     def forms(self) -> list[Form]:
-        """All of one signal but ripples. Where nothing is clamped neither direction is closing: friction is odd in speed.
-
-        A brake's motor angle begins anywhere at each power-on, so that a place along it is another one in the next log; its
-        travel counts from the contact. A machine that clamps nothing has no contact, and only its angle."""
-        bench, every = self.model.bench, enumerate_forms(self.covered, self.ports)
-        directed = [form for form in every if form.gate == "always" or bench.clamps]
-        return [form for form in directed if not (_is_place(form) and bench.clamps)]
+        """All of one signal but ripples. Where nothing is clamped neither direction is closing: friction is odd in speed."""
+        every = enumerate_forms(self.covered, self.ports)
+        return [form for form in every if form.gate == "always" or self.model.bench.clamps]
 
     @cached_property
     def gains(self) -> np.ndarray:
@@ -216,12 +212,19 @@ class Search:
             most = max((p.evidence.gain for p in kept), default=0.0)
             return sorted(kept, key=lambda p: _length(p, max(alone, most + least), model.bench.episodes))
 
-        single = shortest([*self._run(_sharpen(self, self.forms, self.gains)), *self.ripples()])
+        own = self._lasting(range(len(self.forms)))
+        single = shortest([*self._run(_sharpen(self, [self.forms[i] for i in own], self.gains[own])), *self.ripples()])
         most = max((p.evidence.gain for p in single), default=0.0)
         if model.rms(alone - most, self.channel) <= floor:
             return single
         every = shortest([*single, *self._run(_sharpen(self, self.products, self.product_gains))])
         return every if every and every[0].form.other else single
+
+    def _lasting(self, indices: Iterable[int]) -> list[int]:
+        """Those of the forms of one signal that can be a term; the others count for what chance does. A brake's motor angle
+        begins anywhere at each power-on, so that a place along it is another one in the next log; its travel counts from the
+        contact. A machine that clamps nothing has no contact, and only its angle."""
+        return [i for i in indices if not (self.model.bench.clamps and _is_place(self.forms[i]))]
 
     def is_within(self, term: Term) -> bool:
         """Whether a term that the kernel holds within its limits would stay there on these logs anyhow: one at its limit
@@ -237,6 +240,7 @@ class Search:
         if len(signals) > 1:
             every, gains = self.products, self.product_gains
         own = [index for index, form in enumerate(every) if form.port == port and {*form.signals} == {*signals}]
+        own = own if len(signals) > 1 else self._lasting(own)
         return self._run(_sharpen(self, [every[index] for index in own], gains[own])) if own else []
 
     def undecided(self, best: Prospect, rivals: Sequence[Prospect]) -> float:
