@@ -400,6 +400,9 @@ def test_temperatures_of_pads_that_were_never_known_may_be_anything(p):
     snapshot = _snapshot(p)
     snapshot["temperature_known"], snapshot["disc"] = False, 9e9
     assert restart.why_implausible(snapshot, p) == ""
+    s = new_state()[0]
+    restart.resume(s, p, snapshot, 100.0)
+    assert s["temperature_sigma"] == 0.0, "of what was not known nothing is less certain"
 
 
 # The search alone.
@@ -561,6 +564,17 @@ def test_a_motor_controller_that_was_silent_and_counts_from_another_zero_opens_n
     assert _covered(estimates[first:], force[first:])
     assert np.mean(estimates["source"][later] == r.FUSED) > 0.9
     assert _rms((estimates["force"] - force)[later]) < 100.0
+
+
+def test_what_a_silence_may_have_heated_is_less_certain(p):
+    """By hard braking from a motorway, 5 K/s."""
+    rows, _, first, _ = _silent(p, 2.0, zero=8.0)
+    sigmas = []
+    for end in (first, first + 1):
+        state = new_state()
+        estimate(rows[:end], p, state)
+        sigmas.append(state[0]["temperature_sigma"])
+    assert sigmas[1] - sigmas[0] == pytest.approx(5.0 * 2.004, rel=0.01)
 
 
 def test_a_motor_that_stands_where_it_stood_before_a_silence_counts_from_the_same_zero(p):

@@ -143,7 +143,13 @@ def why_implausible(snapshot: Record, p: Record) -> str:
 
 
 @njit
-def rest(s: Record, p: Record, elapsed_s: float) -> None:
+def unseen_heating(elapsed_s: float) -> float:
+    """By how much (K) a disc may have been heated while nobody watched it."""
+    return min(_UNSEEN_K_PER_S * elapsed_s, _UNSEEN_K)
+
+
+@njit
+def rest_unwatched(s: Record, p: Record, elapsed_s: float) -> None:
     """What is less certain after ``elapsed_s`` s in which nobody watched the brake."""
     for i in range(STATES):
         for own in (FAST, NOISE):
@@ -155,7 +161,6 @@ def rest(s: Record, p: Record, elapsed_s: float) -> None:
     doubt_memory(s, p, ordinary_stop(p, AFTER_A_RESTART), max(elapsed_s - SNAPSHOT_S, 0.0))
     s.winding *= exp(-elapsed_s / WINDING_S)
     s.housing *= exp(-elapsed_s / HOUSING_S)
-    s.temperature_sigma += min(_UNSEEN_K_PER_S * elapsed_s, _UNSEEN_K)
 
 
 @entry(STATE, PARAMETERS, SNAPSHOT, float)
@@ -175,9 +180,10 @@ def resume(s: Record, p: Record, snapshot: Record, elapsed_s: float) -> None:
     if snapshot.temperature_known:
         _copy_pads(s.pads, snapshot.pads)
         s.disc, s.history = snapshot.disc, snapshot.history
-        s.temperature_sigma, s.history_sigma = snapshot.temperature_sigma, snapshot.history_sigma
+        s.temperature_sigma = snapshot.temperature_sigma + unseen_heating(elapsed_s)
+        s.history_sigma = snapshot.history_sigma
         s.rested_s = min(max(elapsed_s, CYCLE_S), _FOLLOWED_S)
-    rest(s, p, elapsed_s)
+    rest_unwatched(s, p, elapsed_s)
 
 
 @njit

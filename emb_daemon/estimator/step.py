@@ -35,7 +35,7 @@ from emb_daemon.estimator.resolver import (
     follow_zero,
     may_come_back,
 )
-from emb_daemon.estimator.restart import rest as rest_unwatched
+from emb_daemon.estimator.restart import rest_unwatched, unseen_heating
 from emb_daemon.estimator.rewind import forget_stroke, go_back, keep_all
 from emb_daemon.estimator.status import (
     BEYOND_RANGE,
@@ -162,6 +162,8 @@ def _begin_again(s, p, m):
     if not (s.unknown or s.contact.lost):
         s.clearance, s.clearance_sigma = p.clearance + s.contact_angle - s.contact_anchor, sqrt(s.covariance[CONTACT, CONTACT])
     rest_unwatched(s, p, m.dt)
+    if s.temperature_known:
+        s.temperature_sigma += unseen_heating(m.dt)
     # What is asked of the brake may have been heard before the silence: only a motor that stands shows that it is released.
     s.unknown, s.seen, s.braked = True, True, False
     # In the silence nobody saw it stand.
