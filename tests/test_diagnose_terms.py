@@ -865,6 +865,13 @@ def test_of_a_brake_no_place_along_the_motor_angle_is_asked_for(clamps):
     assert {*rippling(PORTS)} >= {"gear_gain", "torque"}, "ripples are no place"
 
 
+def test_every_form_of_a_heat_balance_may_be_a_term():
+    """Which has no motor angle, and whose logs are not asked what they clamp."""
+    covered = {"clamp_force": (0.0, 2e4), "disc_speed": (0.0, 60.0)}
+    search = SimpleNamespace(forms=list(enumerate_forms(covered, PORTS)), model=SimpleNamespace(bench=SimpleNamespace()))
+    assert len(search.forms) > 10 and Search._lasting(search, range(len(search.forms))) == [*range(len(search.forms))]
+
+
 def test_a_term_beside_which_everything_else_says_the_same_is_not_applied(coupled, monkeypatch):
     """What is proven over the whole grammar owes no chance of its own, but in the end it must still gain what matters."""
     assert revise(coupled[0]).accepted == coupled[0].accepted

@@ -224,7 +224,7 @@ class Search:
         """Those of the forms of one signal that can be a term; the others count for what chance does. A brake's motor angle
         begins anywhere at each power-on, so that a place along it is another one in the next log; its travel counts from the
         contact. A machine that clamps nothing has no contact, and only its angle."""
-        return [i for i in indices if not (self.model.bench.clamps and _is_place(self.forms[i]))]
+        return [i for i in indices if not (_is_place(self.forms[i]) and self.model.bench.clamps)]
 
     def is_within(self, term: Term) -> bool:
         """Whether a term that the kernel holds within its limits would stay there on these logs anyhow: one at its limit
