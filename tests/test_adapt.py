@@ -791,6 +791,17 @@ def test_other_pads_are_as_stiff_as_what_stops_had_shown_of_the_motor_says(ideal
     assert fit(rows, heavier, driven=unsure).values == alone.values, "less than one stroke shows is no more than that"
 
 
+def test_what_motor_and_rotor_have_in_common_stays_open_and_what_tells_them_apart_stays_known(ideal):
+    """Stops show that torque constant and inertia differ by 0.7 %, and say nothing of the 3 % that both may be off by: a
+    stroke that makes them look 7 % apart moves them together, and sigma keeps what they share."""
+    heavier = believed(moved(IDEAL, {"motor.inertia_kg_m2": 0.93 * IDEAL.motor.inertia_kg_m2}))
+    common, own = 0.03**2, 0.005**2
+    found = fit(trained_rows(ideal), heavier, driven=Driven(0.0, 0.0, common, common, common - own))
+    assert found.outcome == r.ACCEPTED and found.evidence["curve_changed"]
+    assert abs(np.log(found.evidence["torque_gain"]) - np.log1p(found.inertia_error)) < 4.0 * np.sqrt(2.0 * own) + 0.002
+    assert found.values["noise.stiffness_relative"] > np.sqrt(common)
+
+
 def test_the_scale_that_training_cannot_see_stays_in_sigma(corrected):
     assert corrected.values["noise.stiffness_relative"] > IDEAL.adaptation.torque_constant_relative
     assert why_out_of_bounds(believed(), corrected.values | {"noise.stiffness_relative": 0.005})

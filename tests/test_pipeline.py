@@ -231,6 +231,20 @@ def test_after_a_silence_no_counter_says_that_less_has_passed(car, skipped):
     assert rows["dt"][30:].sum() == pytest.approx(0.004 * 70, abs=0.009)
 
 
+@pytest.mark.parametrize(
+    ("lost", "gap", "silent"), [((0x100, 0x110), 30, True), ((0x100, 0x110), 20, False), ((0x100,), 30, False)]
+)
+def test_a_controller_is_silent_if_nothing_comes_of_it_and_once(car, lost, gap, silent):
+    """For over a tenth of a second, neither resolver nor current; the next samples are none after a silence."""
+    pipeline = Pipeline(car, ("FL",))
+    pipeline.begin(0)
+    gone = range(30, 30 + gap)
+    frames = [f for f in _sliding(80) if f["can_id"][0] not in lost or round(f["time_ns"][0] / CYCLE_NS) not in gone]
+    _, count = pipeline.collect(np.concatenate(frames), predictions=False)
+    was_silent = pipeline.samples["was_silent"][1:count]
+    assert count == 80 - gap and was_silent[29] == silent and np.count_nonzero(was_silent) == silent
+
+
 @pytest.mark.parametrize("held_ms", [20, 35, 45])
 def test_delayed_frames_change_no_estimate(car, held_ms):
     """A burst after a hold-up: the counter says what passed, the clock does not, though it may be closer to another turn."""

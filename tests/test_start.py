@@ -592,6 +592,15 @@ def test_frames_that_a_bus_loses_move_no_zero(p, silent_s, name):
     assert np.all(estimates["source"][first:] != r.TORQUE_ONLY)
 
 
+def test_a_log_at_a_few_samples_a_second_is_no_silence(p):
+    """Nothing comes of the controller for longer than a tenth of a second each time, and the motor moves on."""
+    path = np.concatenate([np.linspace(0.0, p["clearance"] + 12.0, 20), np.linspace(p["clearance"] + 12.0, 0.0, 20)])
+    rows, _ = brake.samples(p, path, dt=0.125)
+    heard = estimate(rows, p)
+    rows["was_silent"] = True
+    assert estimate(rows, p).tobytes() == heard.tobytes()
+
+
 def test_what_was_asked_before_a_silence_says_nothing_of_what_moved_in_it(p):
     """The vehicle's last status said that nobody brakes; the motor closes, and has not been seen to stand."""
     rows, force, first, release = _silent(p, 1.0, zero=8.0)

@@ -93,8 +93,8 @@ _LED = 0.2
 _HELD, _NOISE_S = 25, 0.5
 #: Standard deviations of the current's noise up to which a change counts as noise.
 _STEP = 5.0
-#: Factor on the calibration's noise of the current from which it is another: three standard deviations of what so few samples
-#: tell.
+#: Factor on the calibration's noise of the current from which it is another: units scatter by a fifth, and so few samples tell
+#: it to a twentieth.
 _NOISIER = 1.25
 #: Standard deviation of the pads' temperature that is reported, K: it moves the force by half a hundredth.
 _TEMPERATURE_UNCERTAIN_K = 10.0
@@ -150,8 +150,8 @@ def _begin_at(s, p, m):
 @njit
 def _may_have_restarted(s, p, m):
     """Whether the motor's controller has been silent, and may count from another zero: by what it counts it is elsewhere. In a
-    log at a reduced rate it is no more silent than before."""
-    silent = m.was_silent and m.dt > max(SILENCE_S, _RARELY * s.dt_before)
+    log at a reduced rate it is no more silent than before, of which its second sample tells nothing yet."""
+    silent = m.was_silent and s.dt_before > 0.0 and m.dt > max(SILENCE_S, _RARELY * s.dt_before)
     return silent and abs(m.angle - s.angle) > ANGLE_MARGIN and p.clearance_sigma > 0.0
 
 
