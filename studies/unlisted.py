@@ -246,6 +246,17 @@ def noise_grows(rng, moments, size):
     return Fault(f"{name} x {factor:.0f}", at, car=once(at, scale(factor, name)))
 
 
+@_family
+def resolver_noisy(rng, moments, size):
+    """A converter of fewer bits, or a noisy one: the angle of a motor that stands flickers."""
+    rad = draw_size(rng, 1e-4, 3e-3)
+
+    def brake(plant):
+        plant["angle_noise"] = rad
+
+    return Fault(f"{1e3 * rad:.2f} mrad", brake=brake)
+
+
 #: Message and signals of a sensor whose contact is loose.
 _LOOSE = {
     "current": (wire.CURRENT, (wire.CURRENT_Q,)),
@@ -346,6 +357,42 @@ def current_remanence(rng, moments, size):
         return shown
 
     return current_fault(f"{100 * share:.1f} %", at, change)
+
+
+@_family
+def current_magnetised(rng, moments, size):
+    """The sensor's core keeps an offset with the sign of the last current that was larger than a hundredth of its range."""
+    amount, least, at = (
+        size.current * draw_size(rng, 0.1, 1.0),
+        size.current * draw_size(rng, 1.0, 5.0),
+        pick_sometime(rng, moments),
+    )
+    state = [0.0]
+
+    def change(values, _):
+        shown = np.empty_like(values)
+        for row, value in enumerate(values):
+            if abs(value) > least:
+                state[0] = amount * np.sign(value)
+            shown[row] = value + state[0]
+        return shown
+
+    return current_fault(f"{amount:.2f} A from {least:.1f} A on", at, change)
+
+
+@_family
+def current_zero_under_load(rng, moments, size):
+    """An amplifier whose zero moves while the inverter switches; none of it is seen where the motor rests."""
+    amount, at, last = size.current * draw_signed(rng, 0.1, 2.0), pick_sometime(rng, moments), [-1.0]
+
+    def car(car, time_s):
+        truth = car.truth[0]
+        if abs(truth["speed"]) > 2.0 or truth["force"] > 200.0 * size.force:
+            last[0] = time_s
+        on = time_s >= at and last[0] >= 0.0 and time_s - last[0] < 0.2
+        car.plants["effects"]["current_offset"]["offset_A"] = amount if on else 0.0
+
+    return Fault(f"{amount:+.2f} A", at, car=car)
 
 
 def _low_pass(time_constant_s: float) -> Callable:

@@ -26,6 +26,7 @@ from emb_daemon.models.contact import (
 )
 from emb_daemon.models.fusion import CONTACT, GAIN, OFFSET, STATES
 from emb_daemon.models.gear import steepest, through_gear
+from emb_daemon.models.plausibility import stays
 from emb_daemon.models.stiffness import characteristic_curve, travel_at
 
 #: Samples for which the angle has stood, from which the motor does: it turns by less than 0.4 rad/s.
@@ -50,7 +51,8 @@ def seek_release(s: Record, p: Record, m: Record) -> None:
     """Contact is unknown until the brake has been observed released: no brake request, park brake off, the motor standing
     without torque. The clearance counts from there. A latched brake needs no current either."""
     released = nobody_brakes(m)
-    s.still_s = s.still_s + m.dt if released and m.angle == s.angle else 0.0
+    still = m.angle == s.angle or stays(s.plausibility, m.angle)
+    s.still_s = s.still_s + m.dt if released and still else 0.0
     torque = abs(s.plausibility.torque_mean)
     loose = torque < p.offset_friction + _LOOSE * p.gear_gain * p.maximum_force
     # A gap may be lost frames, also the first: only a log none of whose samples come a cycle apart is at a reduced rate.

@@ -90,6 +90,7 @@ from emb_daemon.models.plausibility import (
     BEYOND_CHANCE,
     STIFFNESS_WRONG,
     TORQUE_FROZEN,
+    TORQUE_WRONG,
     UNDECIDED,
     beyond_friction,
     count_contradiction,
@@ -112,6 +113,8 @@ _NOTED = 0.003
 #: Share of the largest force from which a model error is reported. Sigma contains a smaller one, and is itself not reported
 #: from less than this.
 _NOTED_ERROR = 0.01
+#: Samples for which a motor must have stood until the smoothed torque is no more that of its motion: five time constants.
+_SMOOTHED = 50
 #: Offset of the motor torque, over its standard deviation at power-on, beyond which no healthy current sensor is off.
 _OFFSET_LARGE = 2.0
 #: Log odds that a change reaches only after more samples than it takes to find a sensor's sudden fault (at most 12.5 a sample,
@@ -531,6 +534,21 @@ def _least_beyond_friction(s, p, m, accelerating, spread):
 
 
 @njit
+def _least_acceleration(s, p, m, stiffness, standing_sigma, smoothed_noise):
+    """Acceleration, rad/s2, that torque beyond friction causes at least in a motor that seems to stand, by this sample or by
+    the smoothed torque, which tells a slow stroke of less. Standard deviations, N m: ``stiffness`` of the load,
+    ``standing_sigma`` of the torque, ``smoothed_noise`` of what noise leaves in the smoothed one."""
+    spread = hypot(stiffness, standing_sigma)
+    torque = (_least_beyond_friction(s, p, m, 0.0, spread) - BEYOND_CHANCE) * spread
+    if s.plausibility.held > _SMOOTHED:
+        lasting = max(sq(standing_sigma) - sq(p.torque_constant * s.current_sigma), 0.0)
+        spread = hypot(stiffness, sqrt(lasting + sq(smoothed_noise)))
+        off = _motor_torque(s, s.error) - s.plausibility.steady
+        torque = max(torque, (_least_beyond_friction(s, p, m, off, spread) - BEYOND_CHANCE) * spread)
+    return torque / p.inertia
+
+
+@njit
 def _count_against_resolver(s, p, m, turning_sigma, standing_sigma, torque, gain, load, coulomb, out):
     """Counts what the torque says against the angle, by `take_sides`' sigmas and `_torque_alone`'s torque and gear: 1 if a
     motor that seems to stand has more torque than friction carries, 2 if that proves that it turned, else 0."""
@@ -544,9 +562,8 @@ def _count_against_resolver(s, p, m, turning_sigma, standing_sigma, torque, gain
         swings = hold(c, s.force, noise, gain, load, coulomb, friction_sigma, load_sigma, p.presliding_angle)
         # A latch holds the motor against any torque, and the stop of an open brake against one that opens it.
         if m.has_status and m.park_brake == 0.0 and (s.force > 0.0 or torque > 0.0):
-            spread = hypot(gain * out.stiffness_sigma, standing_sigma)
-            beyond = _least_beyond_friction(s, p, m, 0.0, spread) - BEYOND_CHANCE
-            if due(c, beyond * spread / p.inertia, s.late + effects.known_delay(p.effects), m.dt):
+            acceleration = _least_acceleration(s, p, m, gain * out.stiffness_sigma, standing_sigma, noise)
+            if due(c, acceleration, s.late + effects.known_delay(p.effects), m.dt):
                 swings = max(swings, 1)
     if np.isfinite(out.innovation):
         spread = hypot(gain * out.stiffness_sigma, turning_sigma)
@@ -621,6 +638,9 @@ def take_sides(
         return facts | RESOLVER_IMPLAUSIBLE | (NO_SOURCE if s.no_current_s > _OLD_S else 0)
     if c.verdict == UNDECIDED and np.isfinite(out.innovation):
         out.sigma = hypot(out.sigma, out.innovation)
+    elif c.verdict == TORQUE_WRONG:
+        # An open brake has no force, unless its angle is frozen.
+        out.sigma = hypot(out.sigma, max(force - out.force, 0.0))
     if swings > 0 and c.verdict == AGREE:
         out.sigma = hypot(out.sigma, hypot(sigma, force - out.force))
         facts |= PATHS_CONTRADICT

@@ -49,7 +49,7 @@ TABLE = {
     "contact_unknown": Fact("the brake has not been seen released since the start", CONTACT_UNCERTAIN, TORQUE_ONLY),
     "contact_lost": Fact("the contact angle was found to be wrong and is being searched for", CONTACT_UNCERTAIN, FUSED),
     "contact_sought": Fact("during this search the torque path is more accurate", CONTACT_UNCERTAIN, TORQUE_ONLY),
-    "force_uncertain": Fact("the force's sigma is over 300 N (from 1 to 2 % of the largest force)", CONTACT_UNCERTAIN, FUSED),
+    "force_uncertain": Fact("the force's sigma is over 300 N, or 2 % of the largest force", CONTACT_UNCERTAIN, FUSED),
     "temperature_unknown": Fact("pad temperatures are unknown", TEMPERATURE_UNCERTAIN, FUSED),
     "temperature_uncertain": Fact("the pad temperatures' sigma is over 10 K", TEMPERATURE_UNCERTAIN, FUSED),
     "thermocouple_stuck": Fact("a backing plate's temperature does not follow its pad", STUCK, FUSED),

@@ -104,9 +104,10 @@ _CERTAINLY = 3.0
 _POSSIBLE = 1.3
 #: Standard deviation of the contact angle, rad, from which it is reported as uncertain.
 _UNCERTAIN_RAD = 0.5
-#: Standard deviation of the force from which it is reported as uncertain: 1 % of an ordinary brake's 30 kN, N; of other brakes
-#: the same, but no less than the first and no more than the second share of their largest force.
-_UNCERTAIN_N, _UNCERTAIN_LEAST, _UNCERTAIN_MOST = 300.0, 0.01, 0.02
+#: Standard deviation of the force from which it is reported as uncertain: 1 % of an ordinary brake's 30 kN, N, so that an
+#: error of 1 kN within three of them is never silent on a larger brake either; and of a smaller one this share of its largest
+#: force.
+_UNCERTAIN_N, _UNCERTAIN_SHARE = 300.0, 0.02
 
 
 @njit
@@ -329,11 +330,13 @@ def _follow_age(s, p, m, turned, moved_zero):
 
 @njit
 def _follow_current_noise(s, p, m):
-    """Mean square of the current's noise, A2, by its changes while the motor stands. One change that is far larger than noise
-    is a step of what the motor is asked for."""
+    """Mean square of the current's noise, A2, by how its changes differ from cycle to cycle while the motor stands: a current
+    that rises and falls with what is asked for, beside an angle that is frozen, is no noise. One that is far larger than noise
+    is a step of that."""
     if m.has_current and s.had_current and p.current_sigma > 0.0:
         alike = exp(-CYCLE_S / p.current_correlation_time) if p.current_correlation_time > 0.0 else 0.0
-        shown = 0.5 * sq(m.current_q - s.current_before) / (1.0 - alike)
+        turned = m.current_q - s.current_before - s.current_change / p.torque_constant
+        shown = sq(turned) / (6.0 - 8.0 * alike + 2.0 * alike * alike)
         shown = min(shown, sq(_STEP * s.current_sigma))
         s.current_square += min(m.dt / _NOISE_S, 1.0) * (shown - s.current_square)
 
@@ -415,8 +418,10 @@ def _look(s, p, m, facts, out):
         facts |= NOT_A_NUMBER
         out.force, out.sigma = 0.0, p.maximum_force
     out.sigma = min(out.sigma, p.maximum_force)
-    uncertain = max(min(_UNCERTAIN_N, _UNCERTAIN_MOST * p.maximum_force), _UNCERTAIN_LEAST * p.maximum_force)
-    if out.sigma > uncertain or s.covariance[CONTACT, CONTACT] > _UNCERTAIN_RAD * _UNCERTAIN_RAD:
+    if (
+        out.sigma > min(_UNCERTAIN_N, _UNCERTAIN_SHARE * p.maximum_force)
+        or s.covariance[CONTACT, CONTACT] > _UNCERTAIN_RAD * _UNCERTAIN_RAD
+    ):
         facts |= FORCE_UNCERTAIN
     return facts
 

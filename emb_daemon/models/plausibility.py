@@ -77,9 +77,10 @@ _STICTION = 0.3
 #: Standard deviations of a smoothed torque that it does not swing by in an hour, one hold in 2000; and of what is the same all
 #: the time, or all the turn of a disc.
 _CERTAIN, _SURELY = 10.0, 3.0
-#: Change below which an angle counts as standing, rad: three counts of a resolver of 12 bit; and factor on the share of
-#: friction that may turn over within it, over the calibration's.
-_STANDS_RAD, _PRESLIDING_TURNS = 0.005, 2.0
+#: Change below which an angle counts as standing, rad: three counts of a resolver of 12 bit; samples whose mean it stands at,
+#: because the one that left the last such place is the farthest out of a noisy angle; and factor on the share of friction that
+#: may turn over within that change, over the calibration's.
+_STANDS_RAD, _CENTRED, _PRESLIDING_TURNS = 0.005, 10, 2.0
 #: Samples of a motor that turns in which the current repeats to the bit: its sensor goes no further. By chance, at one
 #: repetition in five, once in 3000; at the largest current so far fewer are as rare, and a motor that is asked to turn needs
 #: that for some cycles only. A sensor that has gone beyond such a limit repeats more often than that.
@@ -226,10 +227,18 @@ def steady(c: Record, torque: float, accelerating: float, dt: float) -> None:
 
 
 @njit
+def stays(c: Record, angle: float) -> bool:
+    """Whether the motor angle ``angle``, rad, is where it stood at the last sample, whatever it flickers by."""
+    return abs(angle - c.held_angle) <= _STANDS_RAD
+
+
+@njit
 def stands(c: Record, angle: float) -> bool:
     """Whether the motor angle ``angle``, rad, stands."""
-    if abs(angle - c.held_angle) <= _STANDS_RAD:
+    if stays(c, angle):
         c.held += 1
+        if c.held < _CENTRED:
+            c.held_angle += (angle - c.held_angle) / (c.held + 1)
         return True
     c.held_angle, c.held_low, c.held_high = angle, c.steady, c.steady
     c.held = c.swing = c.swings = 0
