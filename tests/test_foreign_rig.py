@@ -384,6 +384,15 @@ def test_stamps_that_jitter_are_no_other_motion_of_a_machine_that_clamps_nothing
     assert ("another motion" in capsys.readouterr().err, off > 10.0) == 2 * (slips_rad > 0.0,)
 
 
+@pytest.mark.parametrize(("way_rad", "told"), [(40.0, "goes from 22000 to 22040 rad"), (5000.0, "covers 5000 rad, more than")])
+def test_an_angle_beyond_our_message_is_told_as_what_it_is(tmp_path, capsys, way_rad, told):
+    """A stage whose zero is elsewhere moves by little; a motor that turns on goes far."""
+    time_s = 0.004 * np.arange(8000)
+    read(tmp_path, columns_of(time_s, angle_rad=22_000.0 + 0.5 * way_rad * (1.0 - np.cos(0.2 * time_s))))
+    said = capsys.readouterr().err
+    assert f"MotorAngle {told}" in said and ("`offset: -22000`" in said) == (way_rad < 3355.0)
+
+
 def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit(tmp_path, capsys):
     """A motor that swings at 20 Hz, sampled at 67: between two samples nobody knows the way."""
     time_s = 0.015 * np.arange(2000)

@@ -381,10 +381,13 @@ def _within(message: str, angle: np.ndarray, low: float, high: float) -> np.ndar
     if not np.any((angle < low) | (angle > high)):
         return angle
     period = 2.0 * np.pi * np.floor((high - low) / (2.0 * np.pi))
-    tell(
-        f"{message}: MotorAngle covers {np.nanmax(angle) - np.nanmin(angle):.4g} rad, more than our message carries and than "
-        f"anything that clamps: it starts anew every {period:.5g} rad; is its unit right?"
-    )
+    least, most = float(np.nanmin(angle)), float(np.nanmax(angle))
+    told = f"covers {most - least:.4g} rad, more than our message carries and than anything that clamps"
+    begin = ""
+    if most - least <= high - low:
+        told = f"goes from {least:.5g} to {most:.5g} rad, beyond what our message carries ({low:.5g} to {high:.5g} rad)"
+        begin = f" If so, `offset: {-least:.0f}` in all logs of the rig lets it begin at 0"
+    tell(f"{message}: MotorAngle {told}: it starts anew every {period:.5g} rad; is its unit right?{begin}")
     return low + np.mod(angle - low, period)
 
 
