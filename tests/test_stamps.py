@@ -333,6 +333,20 @@ def test_a_brake_that_is_said_to_be_released_has_no_force(tmp_path, capsys):
         assert ("ClampForceRef begins at" in capsys.readouterr().err) == said
 
 
+@pytest.mark.parametrize(("preload_N", "status", "said"), [(5000.0, 0.0, True), (0.0, 0.0, False), (5000.0, 1.0, False)])
+def test_a_brake_that_is_said_to_be_released_carries_nothing_in_the_whole_log(tmp_path, capsys, preload_N, status, said):
+    """A specimen that a testing machine loads in cycles and never lets go: taken for released where the log begins, each
+    estimate would lack what it carries then."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=6.0)), 250.0)
+    columns["force_N"] = preload_N + 500.0 * columns["angle_rad"]
+    read(
+        tmp_path,
+        columns,
+        re.sub(r"VEH_Status.(ParkBrake|BrakeRequest): .*", rf"VEH_Status.\1: {{value: {status}}}", foreignkit.COLUMNS),
+    )
+    assert ("at the start and seldom below" in capsys.readouterr().err) == said
+
+
 @pytest.mark.parametrize("motion", ["on", "late", "yields", "to and fro"])
 def test_a_load_that_no_angle_tells_is_of_no_other_time(tmp_path, capsys, motion):
     """A shaft that another motor brakes in steps: it turns on; begins to turn at the end; yields to each step 40 ms later; or
