@@ -199,7 +199,9 @@ def _find_not_released(angle: Series | None, force: Series, status: Signals) -> 
             f"ClampForceRef begins at {begins_N:.4g} N and falls to {lowest_N:.4g} N, {said}: cut off what comes before it "
             "is, or leave VEH_Status out"
         ]
-    if largest_N < _LEAST_CLAMP_N or not np.ptp(force.values):
+    # What rises from nothing has begun to clamp.
+    first_N = float(np.min(force.values[:_LEAST_IN_PART]))
+    if largest_N < _LEAST_CLAMP_N or first_N < _OPEN * largest_N or not np.ptp(force.values):
         return []
     if angle is not None and np.ptp(angle.values) and _find_untared(angle, force):
         return []
