@@ -370,6 +370,29 @@ def test_a_few_late_stamps_cost_a_machine_that_clamps_nothing_no_speed(tmp_path,
     assert ("another motion" in capsys.readouterr().err, off > 50.0) == 2 * (load == "a brake's",)
 
 
+@pytest.mark.parametrize("slips_rad", [0.0, 2.0])
+def test_stamps_that_jitter_are_no_other_motion_of_a_machine_that_clamps_nothing(tmp_path, capsys, slips_rad):
+    """A robot's controller at 100 Hz, each row stamped up to half a period late or early: what one step lacks the next ones
+    make up for. An angle that slips in one step of ten does not come back."""
+    random, true_s = np.random.default_rng(1), 0.01 * np.arange(3000)
+    speed = 120.0 * np.sin(2.0 * true_s)
+    angle = 60.0 * (1.0 - np.cos(2.0 * true_s)) + slips_rad * np.cumsum(random.random(3000) < 0.1)
+    stamps = np.sort(true_s + random.uniform(-0.005, 0.005, 3000))
+    columns = columns_of(stamps, angle_rad=angle, speed_rad_per_s=speed)
+    log = read(tmp_path, columns, foreignkit.COLUMNS.replace("{signal: force_N, unit: N}", "{value: 0}"))
+    off = np.abs(log.samples["speed"] - np.interp(log.time_s, true_s, speed))[5:-5].max()
+    assert ("another motion" in capsys.readouterr().err, off > 10.0) == 2 * (slips_rad > 0.0,)
+
+
+@pytest.mark.parametrize(("way_rad", "told"), [(40.0, "goes from 22000 to 22040 rad"), (5000.0, "covers 5000 rad, more than")])
+def test_an_angle_beyond_our_message_is_told_as_what_it_is(tmp_path, capsys, way_rad, told):
+    """A stage whose zero is elsewhere moves by little; a motor that turns on goes far."""
+    time_s = 0.004 * np.arange(8000)
+    read(tmp_path, columns_of(time_s, angle_rad=22_000.0 + 0.5 * way_rad * (1.0 - np.cos(0.2 * time_s))))
+    said = capsys.readouterr().err
+    assert f"MotorAngle {told}" in said and ("`offset: -22000`" in said) == (way_rad < 3355.0)
+
+
 def test_a_speed_of_a_motion_too_fast_for_its_samples_is_not_called_a_wrong_unit(tmp_path, capsys):
     """A motor that swings at 20 Hz, sampled at 67: between two samples nobody knows the way."""
     time_s = 0.015 * np.arange(2000)

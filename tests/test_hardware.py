@@ -338,16 +338,16 @@ def test_the_friction_of_a_joint_is_found_though_no_brake_has_as_much(tmp_path):
         moved(found, {"contact.clearance_rad": 2.0}, checked=True)
 
 
-def _joint(presliding_rad: float, inertia: float):
-    """A calibration to begin with, and half a minute of what a joint of 0.13 N m and 2e-4 kg m² draws that turns free, whose
-    friction turns over within 2e-3 rad."""
+def _joint(presliding_rad: float, inertia: float, turned: float = 2e-4):
+    """A calibration to begin with, and half a minute of what a joint of 0.13 N m and ``turned`` kg m² draws that turns free,
+    whose friction turns over within 2e-3 rad."""
     stated = _of_a_joint(inertia, offset_Nm=0.2, presliding_angle_rad=presliding_rad)
     random, time_s = np.random.default_rng(3), 0.004 * np.arange(8000)
     angle = np.repeat(random.uniform(1.0, 5.0, 8), 1000) * (1.0 - np.cos(2.0 * np.pi * time_s / 1.0))
     speed, friction = np.gradient(angle, time_s), np.zeros(len(time_s))
     for row, way in enumerate(np.diff(angle), 1):
         friction[row] = np.clip(friction[row - 1] + way / 2e-3, -1.0, 1.0)
-    torque = 0.13 * friction + 2e-4 * np.gradient(speed, time_s) + 0.02 * random.normal(size=len(time_s))
+    torque = 0.13 * friction + turned * np.gradient(speed, time_s) + 0.02 * random.normal(size=len(time_s))
     return stated, _drawn(time_s, angle, speed, torque)
 
 
@@ -365,6 +365,13 @@ def test_friction_that_turns_over_at_once_and_a_light_rotor_are_found_from_a_bra
     before, after = found.before.rmse("torque"), found.after.rmse("torque")
     assert after < 1.3 * 0.02 * scale < before
     assert found.selection.recalibrated["torque"] == pytest.approx(np.sqrt(before**2 - after**2), rel=0.05)
+
+
+@pytest.mark.parametrize("turned", [0.0, 1e-5, 2e-4])
+def test_a_torque_that_accelerates_no_motor_is_told(turned):
+    """A controller computes it without inertia, or a sensor behind the gear sees no rotor."""
+    stated, log = _joint(0.02, 2e-4, turned)
+    assert ("No inertia is left" in verdict(diagnose([log], stated))) == (turned == 0.0)
 
 
 def _breakaways(seed: int):

@@ -18,7 +18,7 @@ from emb_daemon.logs.mapping import Mapping
 from emb_daemon.logs.overflow import overflown
 from emb_daemon.logs.read import read_frames
 from emb_daemon.logs.series import Series
-from emb_daemon.logs.stamps import held_rows, in_time, no_values, strays, without_sign
+from emb_daemon.logs.stamps import held_rows, in_time, no_values, renewed_rows, strays, without_sign
 from emb_daemon.offline import load_log
 
 
@@ -183,6 +183,28 @@ def test_steps_of_resolution_are_not_taken_for_a_raster(truth, step):
     assert held_rows(values) is None
 
 
+def test_rows_that_a_finer_raster_repeats_are_taken_as_they_came(truth, tmp_path):
+    """A controller of 100 Hz whose values come 7 to 13 ms apart, in a table of 1 kHz; where it stands, whatever it repeats."""
+    fine = foreignkit.sampled(truth, 1000.0)
+    came = np.arange(1, len(fine["time_s"]) - 7, 10)
+    came += np.random.default_rng(1).integers(-1, 3, len(came))
+    row = came[np.maximum(np.searchsorted(came, np.arange(len(fine["time_s"])), side="right") - 1, 0)]
+    held, right = (read(tmp_path, columns) for columns in (fine | {n: v[row] for n, v in fine.items() if n != "time_s"}, fine))
+    speed = np.interp(held.time_s, right.time_s, right.samples["speed"])
+    assert np.std((held.samples["speed"] - speed)[10:-10]) < 0.1 * np.std(speed)
+    standing = [np.where(row < 2000, np.sin(row + phase), 0.0) for phase in (0.0, 1.0)]
+    assert np.diff(renewed_rows(standing)).max() < 20
+
+
+def test_values_that_change_by_themselves_are_no_repeated_rows(truth):
+    """Steps of two encoders, and noise beside one."""
+    fine = foreignkit.sampled(truth, 1000.0)
+    coarse = [np.round(fine[name] / step) * step for name, step in (("angle_rad", 0.5), ("force_N", 300.0))]
+    assert renewed_rows(coarse) is None
+    assert renewed_rows([coarse[0], np.random.default_rng(1).normal(size=len(coarse[0]))]) is None
+    assert renewed_rows(coarse[:1]) is None and renewed_rows([]) is None
+
+
 def test_bursts_of_a_sender_that_sends_at_random_stay(capsys):
     time_ns = np.cumsum(np.random.default_rng(1).exponential(1e7, 2000)).astype(np.int64)
     times, rows = in_time("a", time_ns, [np.arange(2000.0)])
@@ -331,6 +353,20 @@ def test_a_brake_that_is_said_to_be_released_has_no_force(tmp_path, capsys):
     ):
         read(tmp_path, log, mapping)
         assert ("ClampForceRef begins at" in capsys.readouterr().err) == said
+
+
+@pytest.mark.parametrize(("preload_N", "status", "said"), [(5000.0, 0.0, True), (0.0, 0.0, False), (5000.0, 1.0, False)])
+def test_a_brake_that_is_said_to_be_released_carries_nothing_in_the_whole_log(tmp_path, capsys, preload_N, status, said):
+    """A specimen that a testing machine loads in cycles and never lets go: taken for released where the log begins, each
+    estimate would lack what it carries then."""
+    columns = foreignkit.sampled(foreignkit.truth(foreignkit.slow(seconds=6.0)), 250.0)
+    columns["force_N"] = preload_N + 500.0 * columns["angle_rad"]
+    read(
+        tmp_path,
+        columns,
+        re.sub(r"VEH_Status.(ParkBrake|BrakeRequest): .*", rf"VEH_Status.\1: {{value: {status}}}", foreignkit.COLUMNS),
+    )
+    assert ("at the start and seldom below" in capsys.readouterr().err) == said
 
 
 @pytest.mark.parametrize("motion", ["on", "late", "yields", "to and fro"])

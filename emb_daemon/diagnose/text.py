@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emb_daemon.calibration.parameters import OFFSET_FRICTION, TORQUE_CONSTANT, in_words
+from emb_daemon.calibration.parameters import INERTIA, OFFSET_FRICTION, TORQUE_CONSTANT, in_words
 from emb_daemon.diagnose.diagnosis import Diagnosis
 from emb_daemon.diagnose.report import amplitudes
 from emb_daemon.diagnose.residuals import UNITS
@@ -25,8 +25,9 @@ _PORTS = {
 _TOLD = 3
 #: Change of the curve's force from which other pads are a better guess than wear of these: units scatter by less.
 _OTHER_PADS = 0.1
-#: Share of the friction as calibrated from which what is left of it is none.
-_NO_FRICTION = 1e-6
+#: Share of the friction as calibrated from which what is left of it is none; the same of the inertia, whose search ends at a
+#: thousandth, or so many of its standard deviations, if that is not a tenth of it either.
+_NO_FRICTION, _NO_INERTIA, _SURE, _OF_STATED = 1e-6, 2e-3, 2.0, 0.1
 #: Factor by which a supplier's torque constant may be off: a gear's loss of a fifth, and amperes by peak or RMS.
 _OF_A_SUPPLIER = 2.0**0.5 / 0.8
 #: Age of a reference that is said, s: half a cycle.
@@ -198,7 +199,24 @@ def _recalibration(diagnosis: Diagnosis) -> list[str]:
         "No friction is left, as if it drove the motor: is `scale: -1` of MotorAngle and MotorSpeed missing, or is the "
         "current another than the motor's?"
     ]
-    return [f"Recalibrated: {', '.join(told)}.", *(turned if none else []), *_other_constant(diagnosis)]
+    asked = [*(turned if none else []), *_without_inertia(diagnosis), *_other_constant(diagnosis)]
+    return [f"Recalibrated: {', '.join(told)}.", *asked]
+
+
+def _without_inertia(diagnosis: Diagnosis) -> list[str]:
+    """The fit went down to the least inertia that is searched, or to what cannot be told from none, which no rotor has: the
+    current bears another torque."""
+    found = diagnosis.recalibrated.get(INERTIA)
+    if found is None:
+        return []
+    within = _SURE * found.sigma
+    is_none = found.value < within and found.value + within < _OF_STATED * found.before
+    if not is_none and found.value > _NO_INERTIA * found.before:
+        return []
+    return [
+        "No inertia is left, as if this current did not accelerate the motor: was its torque measured behind the gear, or "
+        "computed without inertia, or is the stated one far too large?"
+    ]
 
 
 def _other_constant(diagnosis: Diagnosis) -> list[str]:

@@ -95,7 +95,7 @@ def contradictions(corner: str, messages: dict[str, Signals]) -> list[str]:
     speed = series("EMB_{}_Resolver", "MotorSpeed") if angle is None else angle.derivative()
     lines += _find_gaps(own if angle is not None or speed is None else {"MotorSpeed": speed} | own)
     lines += find_command(current) if current is not None else []
-    lines += _find_not_released(force, messages.get("VEH_Status", {})) if force is not None and not bare else []
+    lines += _find_not_released(angle, force, messages.get("VEH_Status", {})) if force is not None and not bare else []
     lines += _find_staying(angle, force) if angle is not None and force is not None and not bare else []
     if angle is not None:
         if np.ptp(angle.values) >= 1.0 - _ABOUT and (jump := starts_anew(angle)):
@@ -185,16 +185,29 @@ def _find_staying(angle: Series, force: Series) -> list[str]:
     ]
 
 
-def _find_not_released(force: Series, status: Signals) -> list[str]:
-    """A line on a log that begins with a force which it loses later, where the vehicle says that the brake is released."""
+def _find_not_released(angle: Series | None, force: Series, status: Signals) -> list[str]:
+    """A line on a log that begins with a force, which it loses later or never, where the vehicle says that the brake is
+    released."""
     at_start = [s.values[0] if isinstance(s, Series) else s for s in map(status.get, ("ParkBrake", "BrakeRequest"))]
     begins_N = float(np.median(force.values[:_LEAST_IN_PART]))
     lowest_N, largest_N = np.quantile(force.values, (0.05, 0.99))
-    if at_start != [0.0, 0.0] or begins_N < _OPEN * largest_N or lowest_N > 0.5 * begins_N:
+    if at_start != [0.0, 0.0] or begins_N < _OPEN * largest_N:
+        return []
+    said = "while ParkBrake and BrakeRequest say that the brake is released"
+    if lowest_N <= 0.5 * begins_N:
+        return [
+            f"ClampForceRef begins at {begins_N:.4g} N and falls to {lowest_N:.4g} N, {said}: cut off what comes before it "
+            "is, or leave VEH_Status out"
+        ]
+    # What rises from nothing has begun to clamp.
+    first_N = float(np.min(force.values[:_LEAST_IN_PART]))
+    if largest_N < _LEAST_CLAMP_N or first_N < _OPEN * largest_N or not np.ptp(force.values):
+        return []
+    if angle is not None and np.ptp(angle.values) and _find_untared(angle, force):
         return []
     return [
-        f"ClampForceRef begins at {begins_N:.4g} N and falls to {lowest_N:.4g} N, while ParkBrake and BrakeRequest say that "
-        "the brake is released: cut off what comes before it is, or leave VEH_Status out"
+        f"ClampForceRef is {begins_N:.4g} N at the start and seldom below {lowest_N:.4g} N, {said}: was the sensor tared? If "
+        "it was, the log begins clamped: leave VEH_Status out"
     ]
 
 

@@ -52,7 +52,7 @@ _SLIP_RAD, _SLIP_DELAY_S, _MOST_APART, _MOST_APART_BARE = 0.3, 0.01, 0.002, 0.02
 #: Travel from which the angle's derivative is compared with the speed, rad; least correlation of both; largest deviation of
 #: their ratio from 1, of which a filter's delay causes some hundredths, and from that of a unit that is then named.
 _WAY_RAD, _CORRELATED, _OTHER_SCALE, _NAMED = 1.0, 0.8, 0.1, 0.04
-#: Number of sparse samples over which angle and speed are compared: the jitter of their stamps is a tenth as large beside it.
+#: Number of samples over which angle and speed are compared where their stamps jitter, which is a tenth as large beside it.
 _AVERAGED = 10
 #: Ratios of units that are often confused.
 _RATIOS = {
@@ -135,24 +135,48 @@ def _another_motion(angle: Series, speed: Series, bare: bool) -> str:
     if not known.any():
         return ""
     went, told = way[known], turned[known]
+    sums = [np.add.reduceat(column, np.arange(0, len(column), _AVERAGED)) for column in (went, told)]
     if angle.is_sparse:
-        went, told = (np.add.reduceat(column, np.arange(0, len(column), _AVERAGED)) for column in (went, told))
+        went, told = sums
     moved, explained = float(np.sum(np.abs(went))), float(np.sum(np.abs(told)))
     # The sum of noise is no travel.
-    if min(moved, explained) > _WAY_RAD and abs(ratio := float(went @ told / (told @ told))) > 0.0:
+    if min(moved, explained) > _WAY_RAD and abs(ratio := _ratio(went, told)) > 0.0:
         correlation = correlation_of(went, told)
         resolved = correlation_of(at[1:][known], at[:-1][known]) > RESOLVED
-        if resolved and abs(correlation) > _CORRELATED and abs(ratio - 1.0) > _OTHER_SCALE:
+        # Stamps that jitter are noise of what the speed tells of a step, which makes the ratio less.
+        is_off = abs(ratio - 1.0) > _OTHER_SCALE < abs(_ratio(*sums) - 1.0)
+        if resolved and abs(correlation) > _CORRELATED and is_off:
             return f"is another motion than MotorAngle, which changes {ratio:.4g} times as fast ({_meaning(ratio)})"
     if angle.is_sparse:
         return ""
     apart = np.abs(way - turned) > _SLIP_RAD + _SLIP_DELAY_S * np.abs(np.diff(at))
     share = float(np.mean(apart[near]))
-    if share <= (_MOST_APART_BARE if bare else _MOST_APART):
+    if share <= (_MOST_APART_BARE if bare else _MOST_APART) or (bare and _is_one_motion(angle, at)):
         return ""
     return (
         f"is another motion than the change of MotorAngle in {100.0 * share:.1f} % of the samples (stamps of a busy computer?)"
     )
+
+
+def _ratio(went: np.ndarray, told: np.ndarray) -> float:
+    """How many times as far an angle ``went``, (n,), as its speed ``told``."""
+    return float(went @ told / (told @ told)) if np.any(told) else 0.0
+
+
+def _is_one_motion(angle: Series, speed: np.ndarray) -> bool:
+    """Whether an angle and the ``speed`` at its times (n,) tell of one motion but for stamps that are late or early by half a
+    period, however many: over many steps that adds no more to the way than in one, and another motion's adds up."""
+    steps = np.diff(angle.time_ns)
+    lasts_s, turns = 1e-9 * steps, 0.5 * (speed[1:] + speed[:-1])
+    # What is stamped late by more is made up for in the next rows, too.
+    known = (steps > 0) & (steps <= _PAUSE * angle.period_ns) & np.isfinite(turns)
+    if np.sum(known) < _AVERAGED:
+        return False
+    first = np.arange(0, int(np.sum(known)), _AVERAGED)
+    apart, fastest = (np.diff(angle.values) - turns * lasts_s)[known], np.abs(turns[known])
+    changed = np.abs(np.add.reduceat(np.diff(speed)[known], first))
+    allowed = _SLIP_RAD + _SLIP_DELAY_S * changed + 1e-9 * angle.period_ns * np.maximum.reduceat(fastest, first)
+    return float(np.mean(np.abs(np.add.reduceat(apart, first)) > allowed)) <= _MOST_APART_BARE
 
 
 def _meaning(ratio: float) -> str:
@@ -357,10 +381,13 @@ def _within(message: str, angle: np.ndarray, low: float, high: float) -> np.ndar
     if not np.any((angle < low) | (angle > high)):
         return angle
     period = 2.0 * np.pi * np.floor((high - low) / (2.0 * np.pi))
-    tell(
-        f"{message}: MotorAngle covers {np.nanmax(angle) - np.nanmin(angle):.4g} rad, more than our message carries and than "
-        f"anything that clamps: it starts anew every {period:.5g} rad; is its unit right?"
-    )
+    least, most = float(np.nanmin(angle)), float(np.nanmax(angle))
+    told = f"covers {most - least:.4g} rad, more than our message carries and than anything that clamps"
+    begin = ""
+    if most - least <= high - low:
+        told = f"goes from {least:.5g} to {most:.5g} rad, beyond what our message carries ({low:.5g} to {high:.5g} rad)"
+        begin = f" If so, `offset: {-least:.0f}` in all logs of the rig lets it begin at 0"
+    tell(f"{message}: MotorAngle {told}: it starts anew every {period:.5g} rad; is its unit right?{begin}")
     return low + np.mod(angle - low, period)
 
 

@@ -29,8 +29,9 @@ _ORDINARY, _PAUSE = 0.95, 10.0
 #: Number of bunches over which a mean time is taken: the error of a stamp is then a twentieth of the time between two.
 _BUNCHES = 20
 #: Least number of changes of a value that is held, and least share of them at whole multiples of the time for which it is
-#: held.
-_LEAST_CHANGES, _IN_STEP = 50, 0.98
+#: held; least share of the changes of any value at which two change together, if all of them were held at once, and largest
+#: share of rows with one: of two that change in half of all rows by themselves, a third would be together.
+_LEAST_CHANGES, _IN_STEP, _AT_ONCE, _SOME_ROWS = 50, 0.98, 0.9, 0.5
 #: Share of the others' range that a stray is away, and of ordinary steps (normal noise's are 2.3 standard deviations); largest
 #: share of strays, and least number of values to tell them in.
 _FAR, _STEPS, _FEW, _FEWEST = 0.5, 5.0, 0.02, 100
@@ -97,10 +98,7 @@ def in_time(source: str, time_ns: np.ndarray, columns: Sequence[np.ndarray]) -> 
     near = steps <= _ONE * mean
     if not near.any():
         return times, rows
-    same = np.ones(len(steps), bool)
-    for column in columns:
-        before, after = column[rows[:-1]], column[rows[1:]]
-        same &= (before == after) | (np.isnan(before) & np.isnan(after))
+    same = ~np.any([_changes(column[rows]) for column in columns], axis=0)
     moving = np.sum(~same)
     if np.sum(near & ~same) > _BUNCHED * moving or np.sum((steps == 0) & ~same) > _SAME_STAMP * moving:
         between = float(np.mean(steps[going_on & ~near]))
@@ -197,11 +195,35 @@ def held_rows(values: np.ndarray) -> np.ndarray | None:
     judged = runs < 0.5 * held * held if least > _WHOLE else np.ones(len(runs), bool)
     if np.mean(off[judged] <= (1.0 if least > _WHOLE else 0.0)) < _IN_STEP:
         return None
-    starts = np.concatenate([[0], changes])
-    ends = np.concatenate([changes, [len(values)]])
+    return _sampled(changes, len(values), held)
+
+
+def _sampled(changes: np.ndarray, count: int, held: float) -> np.ndarray:
+    """Of ``count`` rows those of ``changes`` and the first, and of longer runs one every ``held`` rows."""
+    starts, ends = np.concatenate([[0], changes]), np.concatenate([changes, [count]])
     return np.concatenate(
         [
             start + np.rint(np.arange(0.0, end - start - 0.5 * held, held)).astype(int)
             for start, end in zip(starts, ends, strict=True)
         ]
     )
+
+
+def _changes(values: np.ndarray) -> np.ndarray:
+    """After which rows of a column another value follows, mask (rows - 1,)."""
+    before, after = values[:-1], values[1:]
+    return ~((before == after) | (np.isnan(before) & np.isnan(after)))
+
+
+def renewed_rows(columns: Sequence[np.ndarray]) -> np.ndarray | None:
+    """Rows at which a recorder had new values, where its table is of a finer raster and repeats all of them until the next
+    have come, at whatever times; None where it does not: what was measured by itself changes by itself."""
+    changes = [change for column in columns if (change := _changes(column)).any()]
+    if len(changes) < 2:
+        return None
+    new = np.any(changes, axis=0)
+    together = sum(np.sum(change) >= _AT_ONCE * np.sum(new) for change in changes)
+    if together < 2 or np.sum(new) < _LEAST_CHANGES or np.mean(new) > _SOME_ROWS:
+        return None
+    rows = np.flatnonzero(new) + 1
+    return _sampled(rows, len(new) + 1, float(np.median(np.diff(rows))))

@@ -15,7 +15,7 @@ from emb_daemon.errors import InputError, tell
 from emb_daemon.logs import arrays
 from emb_daemon.logs.mapping_file import Time
 from emb_daemon.logs.read import ZIP, ending_of_content, log_ending, needs_extra, read_file, unpack
-from emb_daemon.logs.stamps import LATEST_S, in_time, since_the_row_before
+from emb_daemon.logs.stamps import LATEST_S, in_time, renewed_rows, since_the_row_before
 from emb_daemon.logs.text_tables import DECIMAL, LISTED, PREAMBLE, UNIT, place_of, read_text, some_of
 from emb_daemon.wire.units import UNITS, stated_in
 
@@ -113,6 +113,8 @@ def _in_time(source: str, table, names: list[str], time) -> dict[str, tuple[np.n
         rows = np.flatnonzero(there) if len(parts) > 1 else np.arange(len(stamps))
         called = f"{source}: {', '.join(part)}" if len(parts) > 1 else source
         times, kept = in_time(called, stamps[rows], [columns[name][rows] for name in part])
+        if (new := renewed_rows([columns[name][rows[kept]] for name in part])) is not None:
+            times, kept = times[new], kept[new]
         found |= {name: (times, columns[name][rows[kept]]) for name in part}
     return found
 
