@@ -221,6 +221,14 @@ def test_a_motor_that_stands_under_a_torque_that_must_turn_it_is_due():
     assert _due_after(flicker, 0.0) is None and _due_after(flicker, -1000.0) is None
 
 
+def test_an_angle_that_flickers_stands_on_however_far_out_the_sample_was_in_which_it_came_to_stand():
+    """What has been seen of a torque that must turn the motor is forgotten only where the angle moves."""
+    c = np.zeros(1, PLAUSIBILITY)
+    angles = np.concatenate([[0.0, 0.0075], 0.004 + 1e-3 * np.random.default_rng(1).standard_normal(20_000)])
+    assert [stands(c[0], angle) for angle in angles].count(False) == 1
+    assert not stands(c[0], 0.012)
+
+
 def test_a_torque_of_one_sample_may_have_just_begun():
     c = np.zeros(1, PLAUSIBILITY)
     said = [stands(c[0], 0.0) and due(c[0], acceleration, 0.0, _DT) for acceleration in [0.0] * 20 + [50_000.0, 0.0] * 20]

@@ -165,14 +165,15 @@ def test_a_motor_that_moves_or_holds_is_not_released(p):
     assert np.all(_unknown(estimate(holding, p))), "the second counts from the status on"
 
 
-def test_a_current_that_flows_in_no_motor_is_an_offset(p):
-    """A brake that stands released for a second holds nothing, whatever its current reads: known again, and the first
-    stroke is
-    right."""
+@pytest.mark.parametrize("flicker", [0.0, 5e-4])
+def test_a_current_that_flows_in_no_motor_is_an_offset(p, flicker):
+    """A brake that stands released for a second holds nothing, whatever its current reads, and by how many counts its angle
+    flickers: known again, and the first stroke is right."""
     rows, force = brake.samples(
         p, np.concatenate([np.zeros(400), brake.clamp(p, 15.0, 0.5), np.full(100, p["clearance"] + 15.0)])
     )
     rows["current_q"] += 3.0
+    rows["angle"] += flicker * np.random.default_rng(1).standard_normal(len(rows))
     estimates = estimate(brake.noisy(rows, p), p)
     unknown = np.flatnonzero(_unknown(estimates[:400]))
     assert 240 < unknown[-1] < 300

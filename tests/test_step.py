@@ -251,3 +251,52 @@ def test_a_step_of_the_current_of_a_motor_that_stands_is_no_noise(parameters):
     rows["current_q"][500:] += 20.0
     estimate(rows, p, state)
     assert state[0]["current_sigma"] < 1.3 * p["current_sigma"]
+
+
+def _slipped(p, before, angle):
+    """ESTIMATE rows and true force of a motor that goes through the ``angle`` (rad) while the rotor of its resolver stands where
+    it was after the rows ``before``; what it shows is noise."""
+    rows, force = brake.samples(p, np.concatenate([before, angle]))
+    rows, rng, begun = brake.noisy(rows, p), np.random.default_rng(3), len(before)
+    rows["angle"][begun:] = rows["angle"][begun] + 1e-3 * rng.standard_normal(len(angle))
+    rows["speed"][begun:] = 0.35 * rng.standard_normal(len(angle))
+    return estimate(rows, p)[begun:], force[begun:]
+
+
+def test_a_slow_stroke_beside_a_frozen_angle_is_said_before_it_is_a_kilonewton(parameters):
+    """Single torques are too noisy to tell of so little beyond friction."""
+    p = brake.ideal(parameters)
+    before = np.concatenate([brake.stops(p, 3), np.zeros(250), brake.clamp(p, 2.0, 0.3)])
+    estimates, force = _slipped(p, before, before[-1] + np.linspace(0.0, 6.0, 1500))
+    off = np.abs(estimates["force"] - force) > 1000.0
+    assert np.mean(off) > 0.3 and not np.any(off & (estimates["mode"] == r.RUNNING))
+
+
+def test_a_current_that_follows_what_is_asked_for_beside_a_frozen_angle_is_no_noise(parameters):
+    """As noise it would excuse the torque that tells of the angle."""
+    p, state = brake.ideal(parameters), new_state()
+    rows, _ = brake.samples(p, np.zeros(2000))
+    rows = brake.noisy(rows, p)
+    rows["current_q"] += 8.0 * np.sin(2.0 * np.pi * 5.0 * 0.004 * np.arange(len(rows)))
+    estimate(rows, p, state)
+    assert state[0]["turned_square"] < 1.5 * p["current_sigma"] ** 2 < state[0]["current_square"]
+
+
+def test_a_force_that_the_torque_asks_for_beside_an_angle_that_is_frozen_open_is_covered(parameters):
+    """Either there is none, and the current is wrong, or the resolver has slipped while the brake was open."""
+    p = brake.ideal(parameters)
+    before = np.concatenate([brake.stops(p, 3), np.zeros(250)])
+    clamped = np.concatenate([np.zeros(100), brake.clamp(p, 9.0, 0.5), np.full(500, p["clearance"] + 9.0)])
+    estimates, force = _slipped(p, before, clamped)
+    beyond = np.abs(estimates["force"] - force) > 3.0 * np.hypot(estimates["sigma"], 25.0)
+    assert force.max() > 4000.0 and beyond.sum() < 40
+
+
+def test_a_sigma_within_whose_threefold_a_kilonewton_lies_is_said_of_a_large_brake_too(parameters):
+    p = brake.ideal(parameters)
+    p["maximum_force"], p["stiffness_relative_sigma"] = 60e3, 0.05
+    rows, _ = brake.samples(p, brake.clamp(p, 15.0, 0.5))
+    estimates = estimate(brake.noisy(rows, p), p)
+    unsure = estimates["sigma"] > 300.0
+    assert np.any(unsure & (estimates["sigma"] < 0.01 * p["maximum_force"]))
+    assert np.all(estimates["reasons"][unsure] & r.CONTACT_UNCERTAIN)

@@ -534,16 +534,18 @@ def _least_beyond_friction(s, p, m, accelerating, spread):
 
 
 @njit
-def _least_acceleration(s, p, m, stiffness, standing_sigma, smoothed_noise):
+def _least_acceleration(s, p, m, stiffness, standing_sigma, friction_sigma):
     """Acceleration, rad/s2, that torque beyond friction causes at least in a motor that seems to stand, by this sample or by
     the smoothed torque, which tells a slow stroke of less. Standard deviations, N m: ``stiffness`` of the load,
-    ``standing_sigma`` of the torque, ``smoothed_noise`` of what noise leaves in the smoothed one."""
+    ``standing_sigma`` of the torque, ``friction_sigma``."""
     spread = hypot(stiffness, standing_sigma)
     torque = (_least_beyond_friction(s, p, m, 0.0, spread) - BEYOND_CHANCE) * spread
     if s.plausibility.held > _SMOOTHED:
-        lasting = max(sq(standing_sigma) - sq(p.torque_constant * s.current_sigma), 0.0)
-        spread = hypot(stiffness, sqrt(lasting + sq(smoothed_noise)))
-        off = _motor_torque(s, s.error) - s.plausibility.steady
+        P, off = s.covariance, _motor_torque(s, s.error) - s.plausibility.steady
+        of_motor = P[OFFSET, OFFSET] + sq(s.plausibility.steady) * P[GAIN, GAIN]
+        current = max(sqrt(s.turned_square), p.current_sigma)
+        noise = smoothed_sigma(p.torque_constant * current, p.current_correlation_time)
+        spread = sqrt(sq(stiffness) + sq(friction_sigma) + sq(noise) + of_motor)
         torque = max(torque, (_least_beyond_friction(s, p, m, off, spread) - BEYOND_CHANCE) * spread)
     return torque / p.inertia
 
@@ -562,7 +564,7 @@ def _count_against_resolver(s, p, m, turning_sigma, standing_sigma, torque, gain
         swings = hold(c, s.force, noise, gain, load, coulomb, friction_sigma, load_sigma, p.presliding_angle)
         # A latch holds the motor against any torque, and the stop of an open brake against one that opens it.
         if m.has_status and m.park_brake == 0.0 and (s.force > 0.0 or torque > 0.0):
-            acceleration = _least_acceleration(s, p, m, gain * out.stiffness_sigma, standing_sigma, noise)
+            acceleration = _least_acceleration(s, p, m, gain * out.stiffness_sigma, standing_sigma, friction_sigma)
             if due(c, acceleration, s.late + effects.known_delay(p.effects), m.dt):
                 swings = max(swings, 1)
     if np.isfinite(out.innovation):

@@ -177,8 +177,9 @@ STATE = np.dtype(
         *fields("f8", "current_before current_change wanted"),
         ("had_current", "?"),
         # Noise of the speed, rad/s, and of the current, A: mean square of a motor that stands, and what is believed: of the
-        # speed the larger of that and the calibration's, of the current the latter unless the first is clearly larger.
-        *fields("f8", "speed_square speed_sigma current_square current_sigma"),
+        # speed the larger of that and the calibration's, of the current the latter unless the first is clearly larger. Of the
+        # current also by how its changes differ.
+        *fields("f8", "speed_square speed_sigma current_square current_sigma turned_square"),
         ("no_current_s", "f8"),
         ("trusted", "?"),
         # Contact angle as clearance or torque placed it, rad. Learned: stiffness over the calibration's, and contact angle

@@ -330,15 +330,17 @@ def _follow_age(s, p, m, turned, moved_zero):
 
 @njit
 def _follow_current_noise(s, p, m):
-    """Mean square of the current's noise, A2, by how its changes differ from cycle to cycle while the motor stands: a current
-    that rises and falls with what is asked for, beside an angle that is frozen, is no noise. One that is far larger than noise
-    is a step of that."""
+    """Mean squares of the current's noise, A2, while the motor stands: by its changes, and by how they differ from cycle to
+    cycle, because a current that rises and falls with what is asked for, beside an angle that is frozen, is no noise. One that
+    is far larger than noise is a step of that."""
     if m.has_current and s.had_current and p.current_sigma > 0.0:
         alike = exp(-CYCLE_S / p.current_correlation_time) if p.current_correlation_time > 0.0 else 0.0
-        turned = m.current_q - s.current_before - s.current_change / p.torque_constant
+        change, share = m.current_q - s.current_before, min(m.dt / _NOISE_S, 1.0)
+        turned = change - s.current_change / p.torque_constant
+        largest = sq(_STEP * s.current_sigma)
+        s.current_square += share * (min(sq(change) / (2.0 - 2.0 * alike), largest) - s.current_square)
         shown = sq(turned) / (6.0 - 8.0 * alike + 2.0 * alike * alike)
-        shown = min(shown, sq(_STEP * s.current_sigma))
-        s.current_square += min(m.dt / _NOISE_S, 1.0) * (shown - s.current_square)
+        s.turned_square += share * (min(shown, largest) - s.turned_square)
 
 
 @njit
