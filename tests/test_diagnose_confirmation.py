@@ -1,5 +1,6 @@
 """Confirmation: one search, of a viscous brake, judged several ways."""
 
+import copy
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,9 @@ from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import Selection, find_changes, revise
 from emb_daemon.diagnose.text import _recalibration, verdict
 from emb_daemon.effects import REGISTRY
+from emb_daemon.errors import InputError
 from emb_daemon.offline import log_of
+from emb_daemon.offline.recording import recording
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 
@@ -273,6 +276,20 @@ def test_validation_has_a_veto(nominal, judged, monkeypatch):
     assert left.present and not left.beyond and left.strongest.signal == "motor_speed" and left.strongest.rms > 20.0
     assert "Proven on these logs but not applied: viscous friction (withdrawn: " in verdict(result)
     assert page(result)
+
+
+def test_a_brake_torque_whose_number_was_full_is_said_and_judges_nothing(viscous, judged):
+    """At 3277 N·m it goes on at the other end, and the brake seems to be driven: no heat is that of such a torque."""
+    whole = viscous[2]
+    full = dataclasses.replace(whole, reference=copy.copy(whole.reference), path=Path("full.log"))
+    full.reference.brake_torque_Nm = np.where(whole.reference.brake_torque_Nm > 500.0, -3200.0, 3200.0)
+    assert not whole.full_torque and "goes from 3200 to -3200 N·m at once" in full.full_torque
+    with pytest.raises(InputError, match="its number, which ends at 3277 N·m, was full; a torque within it is needed"):
+        recording(full)
+    result = judged(full)
+    assert "No brake torque was taken of full.log: the reference brake torque goes from 3200 to" in verdict(result)
+    assert report(result)["brake_torque_full"] == ["full.log"]
+    assert "brake_torque" in result.bench.channels and "brake_torque" not in result.judges.channels
 
 
 def test_a_recalibration_that_validation_logs_refuse_is_said(calibration, judged, monkeypatch):

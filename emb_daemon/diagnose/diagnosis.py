@@ -126,6 +126,12 @@ class Diagnosis:
         return self.plain if self.plain and self.plain[1] > HARM * self.plain[0] else None
 
     @property
+    def full_torque(self) -> dict[str, str]:
+        """By log what a brake torque does whose number was full, of which nothing was taken."""
+        logs = [trial.log for bench in dict.fromkeys((self.bench, self.judges)) for trial in bench.trials]
+        return {log.path.name: log.full_torque for log in logs if log.full_torque}
+
+    @property
     def refused(self) -> dict[str, tuple[float, str]]:
         """Channels whose recalibration these logs prove and which is not applied, with what it gains there and why."""
         return {c: told for c, told in self.selection.refused.items() if c not in self.selection.touched}

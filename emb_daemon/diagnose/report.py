@@ -30,6 +30,7 @@ def report(diagnosis: Diagnosis) -> dict[str, Any]:
         "reference_late_s": diagnosis.reference_late_s,
         "current_late_s": diagnosis.bench.current_late_s,
         "current_dead_A": diagnosis.bench.current_dead_A,
+        "brake_torque_full": [*diagnosis.full_torque],
         "effects": [_finding(diagnosis, finding) for finding in diagnosis.findings],
         "recalibrated": {key: _recalibrated(found) for key, found in diagnosis.recalibrated.items()},
         "stiffness_scale": diagnosis.stiffness_scale,

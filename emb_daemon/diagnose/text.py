@@ -108,7 +108,8 @@ def verdict(diagnosis: Diagnosis) -> str:
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
     parts = (
-        _worse, _plain, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _full, _stated,
+        _worse, _plain, _late, _apart, _dead, _full_torque, _outside, _recalibration, _refused, _no_tolerance, _unexplained,
+        _full, _stated,
     )  # fmt: skip
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
@@ -153,6 +154,12 @@ def _dead(diagnosis: Diagnosis) -> list[str]:
     dead_A = diagnosis.bench.current_dead_A
     told = f"The current is either 0 or above {dead_A:.3g} A, a dead band: the torque path is judged where it is above."
     return [told] if dead_A else []
+
+
+def _full_torque(diagnosis: Diagnosis) -> list[str]:
+    """Logs whose brake torque, and the heat that it makes, nothing was judged by."""
+    told = [f"{name}: {what}" for name, what in diagnosis.full_torque.items()]
+    return [f"No brake torque was taken of {'; '.join(told)}."] if told else []
 
 
 def _outside(diagnosis: Diagnosis) -> list[str]:
