@@ -278,6 +278,44 @@ def test_validation_has_a_veto(nominal, judged, monkeypatch):
     assert page(result)
 
 
+def test_what_is_proven_but_not_applied_is_named_with_its_numbers(nominal, judged):
+    """Also where nothing of its path counts as unexplained: what acts in the brake is asked for, not only what helps."""
+    result = judged(nominal)
+    text = verdict(dataclasses.replace(result, left={}))
+    assert "unexplained" not in text and "not applied: viscous friction (withdrawn: on the validation logs it adds" in text
+    assert "N of the torque path: viscous 0.000" in text
+    told = next(e for e in report(result)["effects"] if e["name"] == "viscous_friction")
+    assert told["withdrawn"] and not told["accepted"] and told["share_explained"] > 0.02
+    assert told["parameters"]["viscous_Nms_per_rad"]["value"] == pytest.approx(3e-4, rel=0.05)
+    assert "proven, not applied" in page(result) and "viscous_friction" not in result.calibration.effects
+
+
+@pytest.mark.parametrize("harm", ["of the recalibration", "of the effect"])
+def test_where_a_recalibration_does_harm_the_effect_beside_it_stays(viscous, judged, monkeypatch, harm):
+    """They were taken out together: the effect first, because nothing else of its path could go. Where the estimator is well
+    without the effect, and the path as well explained, it goes as before."""
+
+    def against(tried, *_):
+        if "torque" in tried.held or not tried.touched:
+            return None
+        if "viscous_friction" in tried.accepted:
+            return "viscous_friction", "the estimator's fused error goes from 10 to 20 N"
+        return ("torque", "the same") if harm == "of the recalibration" else None
+
+    monkeypatch.setattr(confirmation, "_against", against)
+    result = judged()
+    chosen, motor = result.selection, result.bench.calibration.motor
+    stays = harm == "of the recalibration"
+    assert [f.effect.name for f in result.accepted] == ["viscous_friction"] * stays
+    assert (result.calibration.motor.torque_constant_Nm_per_A == motor.torque_constant_Nm_per_A) is stays
+    assert ("Not recalibrated: the torque path, which would gain" in verdict(result)) is stays
+    assert chosen.held == ({"torque"} if stays else set())
+    if stays:
+        assert "motor.torque_constant_Nm_per_A" not in report(result)["recalibrated"]
+        assert report(result)["not_recalibrated"]["torque"]["gain_N"] > 100.0
+        assert chosen.model.noise("torque") < rms_known(chosen.screening.initial["torque"]) ** 2
+
+
 def test_a_brake_torque_whose_number_was_full_is_said_and_judges_nothing(viscous, judged):
     """At 3277 N·m it goes on at the other end, and the brake seems to be driven: no heat is that of such a torque."""
     whole = viscous[2]
@@ -435,6 +473,7 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
         model = SimpleNamespace(bench=bench)
         recalibrated = ()
         instead = longer = None
+        held = frozenset(["torque"])
 
         def without(self, suspect, reason):
             return Chosen([name for name in self.suspects if name != suspect], self.reasons | {suspect: reason})
@@ -478,6 +517,10 @@ def test_a_recalibration_that_went_for_what_an_effect_did_comes_back(monkeypatch
         )
         touched = property(lambda self: {*self.recalibrated})
         instead = longer = None
+        held = frozenset(["torque"])
+
+        def channel_of(self, _):
+            return "torque"
 
         def without(self, suspect, _):
             left = {c: gain for c, gain in self.recalibrated.items() if c != suspect}

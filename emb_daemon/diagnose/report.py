@@ -126,6 +126,8 @@ def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
             entry |= {"shape": term.shape, "memory": term.memory, "gate": term.gate, "range": [term.low, term.high]}
             entry |= {"full_at": term.other_high} if term.other else {}
             entry |= {"memory_range": [term.memory_low, term.memory_high]} if term.memory_low is not None else {}
+    if effect.name in diagnosis.withdrawn:
+        entry["withdrawn"] = True
     if finding.placebos:
         entry |= {"placebo_share": max(finding.placebos.values()), "placebos": dict(finding.placebos)}
     if finding.confounded_with:
