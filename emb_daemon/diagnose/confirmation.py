@@ -95,7 +95,7 @@ def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, E
         after, against = judged(selection)
         if against is None:
             break
-        if instead := _with_base_held(selection, against, judges, judged):
+        if instead := _instead(selection, against, judges, judged):
             selection = instead
             continue
         withdrawn.append(against[0])
@@ -111,28 +111,39 @@ def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, E
     return selection, after
 
 
-def _with_base_held(
+def _instead(
     selection: Selection,
     against: tuple[str, str],
     judges: Bench | None,
     judged: Callable[[Selection], tuple[EpisodeErrors, tuple[str, str] | None]],
 ) -> Selection | None:
-    """Where something speaks ``against`` an effect, the selection with all effects but without what was recalibrated beside
-    them, if nothing speaks against that, and it leaves less of the effect's path than the recalibration without the effect.
+    """Where something speaks ``against`` an effect, the selection with it, but without what was recalibrated beside the
+    effects of a path, or, if the effect is not all that does harm, without anything of another path; None if something speaks
+    against each, or the effect's path is described better without the effect.
 
-    The harm may be the recalibration's, which goes with its path's effects otherwise: then all of them would go for it, one
-    after the other."""
+    What a recalibration does to the estimator goes with its path's effects otherwise: of all effects the one goes first
+    without which least is left, and that may be a true one of the other path."""
     suspect, reason = against
-    channel, bare = selection.channel_of(suspect), selection.without(suspect, reason)
-    if suspect == channel or channel not in FORCE_CHANNELS or channel in selection.held:
+    own = selection.channel_of(suspect)
+    if suspect == own or own not in FORCE_CHANNELS:
         return None
-    held = revise(selection.with_base_held(channel, reason))
-    if suspect not in held.accepted or judged(held)[1] is not None:
-        return None
-    if judged(bare)[1] is not None:
-        return held
-    left, without = _left(held, judges), _left(bare, judges)
-    return held if channel in left and left[channel] < without[channel] else None
+    bare = selection.without(suspect, reason)
+    does_all_harm = judged(bare)[1] is None
+    paths = sorted(selection.touched & {*FORCE_CHANNELS}, key=lambda channel: channel != own)
+    for channel in (c for c in paths if c not in selection.held):
+        held = revise(selection.with_base_held(channel, reason))
+        if suspect not in held.accepted or judged(held)[1] is not None:
+            continue
+        left, without = _left(held, judges), _left(bare, judges)
+        if not does_all_harm or left.get(own, np.inf) < without.get(own, np.inf):
+            return held
+    for channel in () if does_all_harm else (c for c in paths if c != own):
+        alone = selection
+        while gone := [name for name in alone.suspects if alone.channel_of(name) == channel]:
+            alone = alone.without(gone[0], reason)
+        if judged(alone)[1] is None:
+            return alone
+    return None
 
 
 def _against(

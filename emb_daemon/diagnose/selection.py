@@ -135,6 +135,8 @@ class Selection:
     def with_base_held(self, channel: str, reason: str) -> "Selection":
         """The base parameters of a channel back at the calibration, and its effects refitted to that. Where a log finds its
         contact is none of the calibration's."""
+        if channel in self.suspects:
+            return self.without(channel, reason)
         base = [c for c in self.model.own(channel) if not c.effect and c.name != CLEARANCE]
         model = self.model.entered({c: c.start for c in base}, chosen=base).refined({channel})
         gain = model.rms(float(np.sum(model.left_out(channel) - self.model.left_out(channel))), channel)
