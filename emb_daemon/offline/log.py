@@ -61,7 +61,7 @@ class Log:
         near = np.abs(later) < _NEAR_NS
         return float(np.median(later[near])) if near.any() else 0.0
 
-    @cached_property
+    @property
     def full_torque(self) -> str:
         """What the reference brake torque does where its number was full, in words; nothing if it never was."""
         torque = self.reference.brake_torque_Nm[np.isfinite(self.reference.brake_torque_Nm)]
