@@ -170,6 +170,8 @@ class Replay:
         logs = {corner: make_log(samples[rows], frames, corner, Path(path)) for corner, rows in mine.items()}
         if self._measured_torque:
             for corner, log in logs.items():
+                if log.full_torque:
+                    raise InputError(f"{path}: {log.full_torque}; expected a torque within it, or without --measured-torque")
                 samples["brake_torque"][mine[corner]] = log.reference.latest(log.time_ns, log.reference.brake_torque_Nm)
         estimates = estimate(samples, pipeline.parameters, pipeline.states, self.adaptation)
         results = [

@@ -1,5 +1,6 @@
 """Confirmation: one search, of a viscous brake, judged several ways."""
 
+import copy
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,9 @@ from emb_daemon.diagnose.search import select
 from emb_daemon.diagnose.selection import Selection, find_changes, revise
 from emb_daemon.diagnose.text import _recalibration, verdict
 from emb_daemon.effects import REGISTRY
+from emb_daemon.errors import InputError
 from emb_daemon.offline import log_of
+from emb_daemon.offline.recording import recording
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
 
@@ -275,6 +278,116 @@ def test_validation_has_a_veto(nominal, judged, monkeypatch):
     assert page(result)
 
 
+def test_what_is_proven_but_not_applied_is_named_with_its_numbers(nominal, judged):
+    """Also where nothing of its path counts as unexplained: what acts in the brake is asked for, not only what helps."""
+    result = judged(nominal)
+    text = verdict(dataclasses.replace(result, left={}))
+    assert "unexplained" not in text and "not applied: viscous friction (withdrawn: on the validation logs it adds" in text
+    assert "N of the torque path: viscous 0.000" in text
+    told = next(e for e in report(result)["effects"] if e["name"] == "viscous_friction")
+    assert told["withdrawn"] and not told["accepted"] and told["share_explained"] > 0.02
+    assert told["parameters"]["viscous_Nms_per_rad"]["value"] == pytest.approx(3e-4, rel=0.05)
+    assert "proven, not applied" in page(result) and "viscous_friction" not in result.calibration.effects
+
+
+@pytest.mark.parametrize("harm", ["of the recalibration", "of the effect"])
+def test_where_a_recalibration_does_harm_the_effect_beside_it_stays(viscous, judged, monkeypatch, harm):
+    """They were taken out together: the effect first, because nothing else of its path could go. Where the estimator is well
+    without the effect, and the path as well explained, it goes as before."""
+
+    def against(tried, *_):
+        if "torque" in tried.held or not tried.touched:
+            return None
+        if "viscous_friction" in tried.accepted:
+            return "viscous_friction", "the estimator's fused error goes from 10 to 20 N"
+        return ("torque", "the same") if harm == "of the recalibration" else None
+
+    monkeypatch.setattr(confirmation, "_against", against)
+    result = judged()
+    chosen, motor = result.selection, result.bench.calibration.motor
+    stays = harm == "of the recalibration"
+    assert [f.effect.name for f in result.accepted] == ["viscous_friction"] * stays
+    assert (result.calibration.motor.torque_constant_Nm_per_A == motor.torque_constant_Nm_per_A) is stays
+    assert ("Not recalibrated: the torque path, which would gain" in verdict(result)) is stays
+    assert chosen.held == ({"torque"} if stays else set())
+    if stays:
+        assert "motor.torque_constant_Nm_per_A" not in report(result)["recalibrated"]
+        assert report(result)["not_recalibrated"]["torque"]["gain_N"] > 100.0
+        assert chosen.model.noise("torque") < rms_known(chosen.screening.initial["torque"]) ** 2
+
+
+@dataclasses.dataclass(frozen=True)
+class _OfTwoPaths:
+    """What was chosen, of two paths: a disc that is uneven and a motor that cogs, each beside a recalibration."""
+
+    accepted: tuple = ("disc_thickness_variation", "cogging_torque")
+    recalibrated: tuple = ("stiffness", "torque")
+    held: frozenset = frozenset()
+    model = SimpleNamespace(bench=SimpleNamespace(calibration=None, residuals=lambda _: {}))
+    instead = longer = None
+
+    def channel_of(self, suspect):
+        return {"disc_thickness_variation": "stiffness", "cogging_torque": "torque"}.get(suspect, suspect)
+
+    @property
+    def suspects(self):
+        return [*self.accepted, *(c for c in self.recalibrated if c not in map(self.channel_of, self.accepted))]
+
+    @property
+    def touched(self):
+        return {self.channel_of(suspect) for suspect in self.suspects}
+
+    def without(self, gone, _):
+        left = (tuple(name for name in names if name != gone) for names in (self.accepted, self.recalibrated))
+        return dataclasses.replace(self, **dict(zip(("accepted", "recalibrated"), left, strict=True)))
+
+    def with_base_held(self, channel, _):
+        left = tuple(c for c in self.recalibrated if c != channel)
+        return dataclasses.replace(self, recalibrated=left, held=self.held | {channel})
+
+
+@pytest.mark.parametrize(
+    ("harm", "stays", "held"),
+    [
+        (lambda s: "torque" in s.recalibrated, _OfTwoPaths.accepted, {"torque"}),
+        (lambda s: "torque" in s.touched, ("disc_thickness_variation",), set()),
+        (lambda s: "disc_thickness_variation" in s.accepted, ("cogging_torque",), set()),
+        (lambda s: {*_OfTwoPaths.accepted} <= {*s.accepted}, ("cogging_torque",), set()),
+    ],
+    ids=["a recalibration", "all of a path", "the effect", "two effects together"],
+)
+def test_a_true_effect_does_not_go_for_the_harm_of_another_path(monkeypatch, harm, stays, held):
+    """On a brake with an uneven disc and a motor that saturates a torque path that is recalibrated for the latter took the
+    fused error from 84 to 177 N; least was left, by a little, without the disc, which went first."""
+
+    def against(tried, *_):
+        return (tried.suspects[0], "the fused error goes from 84 to 177 N") if harm(tried) else None
+
+    monkeypatch.setattr(confirmation, "errors", lambda *_: None)
+    monkeypatch.setattr(confirmation, "whole", lambda _: "fused")
+    monkeypatch.setattr(confirmation, "left_out_errors", lambda _: None)
+    monkeypatch.setattr(confirmation, "_beyond_bounds", lambda _: [])
+    monkeypatch.setattr(confirmation, "_against", against)
+    monkeypatch.setattr(confirmation, "revise", lambda selection: selection)
+    monkeypatch.setattr(confirmation, "_left", lambda s, _: {"stiffness": 90.0 - 50.0 * (s.accepted[:1] == stays[:1])})
+    found = confirmation.confirm(_OfTwoPaths(), None)[0]
+    assert (found.accepted, found.held) == (stays, held)
+
+
+def test_a_brake_torque_whose_number_was_full_is_said_and_judges_nothing(viscous, judged):
+    """At 3277 N·m it goes on at the other end, and the brake seems to be driven: no heat is that of such a torque."""
+    whole = viscous[2]
+    full = dataclasses.replace(whole, reference=copy.copy(whole.reference), path=Path("full.log"))
+    full.reference.brake_torque_Nm = np.where(whole.reference.brake_torque_Nm > 500.0, -3200.0, 3200.0)
+    assert not whole.full_torque and "goes from 3200 to -3200 N·m at once" in full.full_torque
+    with pytest.raises(InputError, match="its number, which ends at 3277 N·m, was full; a torque within it is needed"):
+        recording(full)
+    result = judged(full)
+    assert "No brake torque was taken of full.log: the reference brake torque goes from 3200 to" in verdict(result)
+    assert report(result)["brake_torque_full"] == ["full.log"]
+    assert "brake_torque" in result.bench.channels and "brake_torque" not in result.judges.channels
+
+
 def test_a_recalibration_that_validation_logs_refuse_is_said(calibration, judged, monkeypatch):
     """By a log of a brake that is as calibrated. The fitted log goes on being as wrong as it was, and that is told, too."""
     another = log_of(next(drives(_from_which_it_starts(calibration), 54, {}, stops=3)))
@@ -418,6 +531,7 @@ def test_what_ruins_one_log_is_taken_out_though_all_together_gain(monkeypatch, o
         model = SimpleNamespace(bench=bench)
         recalibrated = ()
         instead = longer = None
+        touched = held = frozenset(["torque"])
 
         def without(self, suspect, reason):
             return Chosen([name for name in self.suspects if name != suspect], self.reasons | {suspect: reason})
@@ -461,6 +575,9 @@ def test_a_recalibration_that_went_for_what_an_effect_did_comes_back(monkeypatch
         )
         touched = property(lambda self: {*self.recalibrated})
         instead = longer = None
+
+        def channel_of(self, suspect):
+            return suspect
 
         def without(self, suspect, _):
             left = {c: gain for c, gain in self.recalibrated.items() if c != suspect}

@@ -97,6 +97,21 @@ def test_what_follows_slowly_on_a_power_of_the_brake_torque_is_no_power_of_what_
     assert best.form.memory_scale == pytest.approx(7.0, rel=0.4)
 
 
+def test_a_gear_that_is_worn_at_one_place_along_its_travel_is_seen_as_that(calibration):
+    """Its transmission, which load takes whichever way the motor turns; as friction there it would change its sign with the
+    motion. The calibration is wrong by what the gear of the log does not have."""
+    worn = Term(
+        name="term:worn", port="gear_gain", signal="travel", shape="bump", coefficient=0.2, scale=2.0, centre=18.0, low=0.0,
+        high=40.0,
+    )  # fmt: skip
+    log = log_of(next(drives(calibration, 37, {}, stops=3)))
+    model = Model.of(Bench([log], msgspec.structs.replace(calibration, terms=(worn,)))).refined(["torque"])
+    search = Search(model, "torque", grammar._signals(model))
+    best = search.forms[int(np.argmax(search.gains))]
+    assert best.means == ("gear_gain", "travel") and abs(best.centre - 18.0) < best.scale + 2.0
+    assert search._run([best])[0].evidence.values[0] < -0.05
+
+
 def test_what_friction_does_as_it_turns_over_makes_no_term(calibration):
     """A motor that holds just behind a reversal holds with a friction that no model knows, in each stop: with nothing hidden
     what follows braking gains far less than what matters."""

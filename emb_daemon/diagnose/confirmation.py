@@ -4,10 +4,11 @@ Every accepted suspect must lower the residual of its own path on episodes left 
 because otherwise that would take over an error of the other path and contradict a true term. The error of the fused force
 must not rise either, nor clearly that of a single log, unless all together gain by a larger factor: a fit that gains a little
 on a log with large errors may ruin all others, which the mean would not show. Validation logs, if given, have a veto. What
-fails is taken out one by one, and the rest is refitted.
+fails is taken out one by one, and the rest is refitted. Where only what was recalibrated beside an effect does harm, that goes
+and the effect stays.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from emb_daemon.diagnose.evidence import Moments, leave_out, solve_within
 from emb_daemon.diagnose.model import is_shape
 from emb_daemon.diagnose.residuals import FORCE_CHANNELS, UNITS, Bench
 from emb_daemon.diagnose.screening import Q_VALUE
-from emb_daemon.diagnose.selection import TOO_LARGE, Selection
+from emb_daemon.diagnose.selection import TOO_LARGE, Selection, revise
 from emb_daemon.diagnose.unexplained import CLEARLY
 from emb_daemon.offline.score import EpisodeErrors, rmse
 
@@ -29,6 +30,8 @@ _FOLDS = 4
 HARM = 1.05
 #: The same for a single log, whose few episodes scatter more: the factor from which a residual counts as unexplained.
 _LOG_HARM = CLEARLY
+#: Why a term goes for effects of the catalogue, which explain in its place what it did.
+NAMED_LESS = "effects of the catalogue alone leave less of left-out episodes and validation logs"
 #: Share of the samples with a force before that must have one after: a delay takes some at the edges.
 _KEPT = 0.99
 
@@ -48,8 +51,7 @@ def confirm(selection: Selection, judges: Bench | None) -> tuple[Selection, Epis
     terms = [c for c in selection.candidates.values() if c.made]
     if all(made[c.channel] < named[c.channel] for c in terms if c.accepted and c.channel in made):
         return confirmed
-    worse = "effects of the catalogue alone leave less of left-out episodes and validation logs"
-    return alone[0].noted(replace(c, accepted=False, reason=worse if c.accepted else c.reason) for c in terms), alone[1]
+    return alone[0].noted(replace(c, accepted=False, reason=NAMED_LESS if c.accepted else c.reason) for c in terms), alone[1]
 
 
 def _with_longer(
@@ -59,7 +61,7 @@ def _with_longer(
     that describes it so was taken out again: then they stay, if what is confirmed with them leaves less of the path."""
     terms = [name for name in longer.accepted if name not in confirmed[0].accepted]
     paths = {longer.candidates[name].channel for name in terms}
-    if not terms or not paths <= confirmed[0].refused.keys() - confirmed[0].touched:
+    if not terms or not paths <= confirmed[0].not_recalibrated:
         return confirmed
     found = _confirmed(longer, judges)
     left, without = _left(found[0], judges), _left(confirmed[0], judges)
@@ -93,6 +95,9 @@ def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, E
         after, against = judged(selection)
         if against is None:
             break
+        if instead := _instead(selection, against, judges, judged):
+            selection = instead
+            continue
         withdrawn.append(against[0])
         selection = selection.without(*against)
     # A recalibration may have gone for what something else did that went later.
@@ -104,6 +109,41 @@ def _confirmed(selection: Selection, judges: Bench | None) -> tuple[Selection, E
             if against is None and not harm(after, its, main):
                 selection, after = again, its
     return selection, after
+
+
+def _instead(
+    selection: Selection,
+    against: tuple[str, str],
+    judges: Bench | None,
+    judged: Callable[[Selection], tuple[EpisodeErrors, tuple[str, str] | None]],
+) -> Selection | None:
+    """Where something speaks ``against`` an effect, the selection with it, but without what was recalibrated beside the
+    effects of a path, or, if the effect is not all that does harm, without anything of another path; None if something speaks
+    against each, or the effect's path is described better without the effect.
+
+    What a recalibration does to the estimator goes with its path's effects otherwise: of all effects the one goes first
+    without which least is left, and that may be a true one of the other path."""
+    suspect, reason = against
+    own = selection.channel_of(suspect)
+    if suspect == own or own not in FORCE_CHANNELS:
+        return None
+    bare = selection.without(suspect, reason)
+    does_all_harm = judged(bare)[1] is None
+    paths = sorted(selection.touched & {*FORCE_CHANNELS}, key=lambda channel: channel != own)
+    for channel in (c for c in paths if c not in selection.held):
+        held = revise(selection.with_base_held(channel, reason))
+        if suspect not in held.accepted or judged(held)[1] is not None:
+            continue
+        left, without = _left(held, judges), _left(bare, judges)
+        if not does_all_harm or left.get(own, np.inf) < without.get(own, np.inf):
+            return held
+    for channel in () if does_all_harm else (c for c in paths if c != own):
+        alone = selection
+        while gone := [name for name in alone.suspects if alone.channel_of(name) == channel]:
+            alone = alone.without(gone[0], reason)
+        if judged(alone)[1] is None:
+            return alone
+    return None
 
 
 def _against(

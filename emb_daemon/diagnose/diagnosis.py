@@ -17,7 +17,15 @@ from emb_daemon.calibration.parameters import moved, parameter, value_of
 from emb_daemon.calibration.terms import REMEMBERING, Term
 from emb_daemon.calibration.types import Calibration, Provenance, Source, to_parameters
 from emb_daemon.diagnose.comparison import by_log, comparison, errors, whole
-from emb_daemon.diagnose.confirmation import HARM, confirm, harm_of_logs, left_out_residuals, quarters, validation_gains
+from emb_daemon.diagnose.confirmation import (
+    HARM,
+    NAMED_LESS,
+    confirm,
+    harm_of_logs,
+    left_out_residuals,
+    quarters,
+    validation_gains,
+)
 from emb_daemon.diagnose.coordinates import Coordinate, about_middle, by_key, tolerated
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.late_reference import may_be_late, reference_late_s
@@ -126,9 +134,15 @@ class Diagnosis:
         return self.plain if self.plain and self.plain[1] > HARM * self.plain[0] else None
 
     @property
+    def full_torque(self) -> dict[str, str]:
+        """By log what a brake torque does whose number was full, of which nothing was taken."""
+        logs = [trial.log for bench in dict.fromkeys((self.bench, self.judges)) for trial in bench.trials]
+        return {log.path.name: log.full_torque for log in logs if log.full_torque}
+
+    @property
     def refused(self) -> dict[str, tuple[float, str]]:
         """Channels whose recalibration these logs prove and which is not applied, with what it gains there and why."""
-        return {c: told for c, told in self.selection.refused.items() if c not in self.selection.touched}
+        return {c: told for c, told in self.selection.refused.items() if c in self.selection.not_recalibrated}
 
     @property
     def whole(self) -> str:
@@ -230,14 +244,14 @@ def diagnose_bench(bench: Bench, judges: Bench | None, progress: Progress) -> Di
         judges=judging,
         judged_on=judged_on,
         selection=selection,
-        findings=findings(selection),
+        findings=findings(selection, chosen),
         recalibrated=_list_recalibrated(selection),
         before=before,
         after=after,
         validated=validation_gains(selection, judges) if judges else {},
         judged_residual={c: (rms_known(judged_before[c]), rms_known(final[c])) for c in judging.channels} if judges else {},
         left=_left(selection, chosen, judged_before, final, judging, augmented),
-        withdrawn=tuple(name for name in chosen.accepted if name not in selection.accepted),
+        withdrawn=_names_withdrawn(selection, chosen),
         outside=outside_range(judges.under(augmented), made) if judges else (),
         plain=_plain(selection, judges, final),
         seconds=time.monotonic() - begin,
@@ -289,11 +303,22 @@ def _refuse_silent(bench: Bench) -> None:
     )
 
 
-def findings(selection: Selection) -> tuple[Candidate, ...]:
-    """What became of every effect and term, with values as they are applied; accepted ones first, each group by share
-    explained."""
-    described = [_describe(selection, candidate) for candidate in selection.candidates.values()]
-    return tuple(sorted(described, key=lambda f: (not f.accepted, f.in_calibration, -f.share_explained)))
+def findings(selection: Selection, chosen: Selection) -> tuple[Candidate, ...]:
+    """What became of every effect and term, with values as they are applied; of what confirmation took out again as the search
+    fitted it (``chosen``). Accepted ones first, each group by share explained."""
+    described = {name: _describe(selection, candidate) for name, candidate in selection.candidates.items()}
+    for name in _names_withdrawn(selection, chosen):
+        found = _describe(chosen, chosen.candidates[name])
+        described[name] = replace(found, accepted=False, reason=selection.candidates[name].reason)
+    return tuple(sorted(described.values(), key=lambda f: (not f.accepted, f.in_calibration, -f.share_explained)))
+
+
+def _names_withdrawn(selection: Selection, chosen: Selection) -> tuple[str, ...]:
+    """Names of what was proven on its own path, but is not in use; not of what effects of the catalogue explain in its
+    place."""
+    found = selection.candidates
+    gone = [name for name in chosen.accepted if name in found and not found[name].accepted]
+    return tuple(name for name in gone if found[name].reason != NAMED_LESS)
 
 
 def _describe(selection: Selection, candidate: Candidate) -> Candidate:
@@ -367,7 +392,7 @@ def _list_recalibrated(selection: Selection) -> dict[str, Recalibrated]:
     left-out episodes lose without them, everything else free. That is found by running the estimator without them, because
     regressors at the end of a long fit do not predict the residual at its beginning."""
     model, calibration = selection.model, selection.model.bench.calibration
-    base = [c for c in selection.applied() if not c.effect]
+    base = [c for c, value in selection.applied().items() if not c.effect and value != c.start]
     groups: dict[str, list[Coordinate]] = {}
     for c in base:
         groups.setdefault(c.name.partition("[")[0].removesuffix(".over_force").removesuffix(".over_speed"), []).append(c)
@@ -427,7 +452,7 @@ def _left(
         known, log, time_s = screening.achieved(model, channel, force, rise, samples), "", None
         if channel in FORCE_CHANNELS and not is_beyond(last, known):
             each = _by_log(selection, channel, judging, before[channel], after[channel])
-            if channel in selection.refused and channel not in selection.touched:
+            if channel in selection.not_recalibrated:
                 each += _by_log(selection, channel, model.bench, *2 * [screening.initial[channel]])
             if beyond := [one for one in each if is_beyond(*one[1:3])]:
                 first, last, known, log = max(beyond, key=lambda one: one[1] / one[2])

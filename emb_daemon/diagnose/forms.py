@@ -42,7 +42,7 @@ _TYPED: dict[str, tuple[str, ...]] = {
         "friction_power",
         "energy",
     ),
-    "gear_gain": ("clamp_force", "motor_angle", "brake_torque", *TEMPERATURES),
+    "gear_gain": ("clamp_force", "motor_angle", "travel", "brake_torque", *TEMPERATURES),
     "gear_friction": ("motor_speed", "clamp_force", "motor_angle", "travel", *_MOTOR_HEAT, *_SLOW),
     "heat_share": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "friction_power", "energy"),
     "contact_conductance": ("clamp_force", "disc_speed", "surface_temperature", "disc_temperature", "energy"),

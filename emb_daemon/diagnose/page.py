@@ -185,6 +185,7 @@ def _candidates(report: Page, diagnosis: Diagnosis) -> None:
     rows = []
     for f in diagnosis.findings:
         state = "accepted" if f.accepted else "in calibration" if f.in_calibration else ""
+        state = "proven, not applied" if f.effect.name in diagnosis.withdrawn else state
         unit = UNITS.get(f.channel or "", "")
         gain = f"{f.gain:.3g} {unit}" if f.channel and not f.in_calibration else "–"
         rows.append([title(f), f.effect.path, state, gain, f"{f.q_value:.2g}", size(f), f.reason])

@@ -30,6 +30,7 @@ def report(diagnosis: Diagnosis) -> dict[str, Any]:
         "reference_late_s": diagnosis.reference_late_s,
         "current_late_s": diagnosis.bench.current_late_s,
         "current_dead_A": diagnosis.bench.current_dead_A,
+        "brake_torque_full": [*diagnosis.full_torque],
         "effects": [_finding(diagnosis, finding) for finding in diagnosis.findings],
         "recalibrated": {key: _recalibrated(found) for key, found in diagnosis.recalibrated.items()},
         "stiffness_scale": diagnosis.stiffness_scale,
@@ -125,6 +126,8 @@ def _finding(diagnosis: Diagnosis, finding: Candidate) -> dict:
             entry |= {"shape": term.shape, "memory": term.memory, "gate": term.gate, "range": [term.low, term.high]}
             entry |= {"full_at": term.other_high} if term.other else {}
             entry |= {"memory_range": [term.memory_low, term.memory_high]} if term.memory_low is not None else {}
+    if effect.name in diagnosis.withdrawn:
+        entry["withdrawn"] = True
     if finding.placebos:
         entry |= {"placebo_share": max(finding.placebos.values()), "placebos": dict(finding.placebos)}
     if finding.confounded_with:

@@ -143,7 +143,8 @@ def _synchronous(log: Log) -> tuple[np.ndarray, np.ndarray]:
         shifted[1:] = (1.0 - share) * force[1:] + share * force[:-1]
     elif share < 0.0:
         shifted[:-1] = (1.0 + share) * force[:-1] - share * force[1:]
-    return shifted, reference.at(time, reference.brake_torque_Nm)
+    # A torque whose number was full is another one, nobody knows in how many of its samples.
+    return shifted, np.full(len(time), np.nan) if log.full_torque else reference.at(time, reference.brake_torque_Nm)
 
 
 def _temperatures(log: Log) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from emb_daemon.calibration.parameters import CLEARANCE
 from emb_daemon.diagnose.coordinates import Coordinate, Values, about_middle
 from emb_daemon.diagnose.evidence import Evidence
 from emb_daemon.diagnose.model import LASTING, Model, is_shape
@@ -58,6 +59,8 @@ class Selection:
     recalibrated: dict[str, float] = field(default_factory=dict)
     #: Channels whose recalibration was taken out again, with what it gained and why.
     refused: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    #: Channels whose base parameters stand as calibrated beside what was found in them, because refitting them did harm.
+    held: frozenset[str] = frozenset()
     dropped: frozenset[str] = frozenset()  #: effects that were accepted and are not to be tried again
     #: What the residual depended on before any effect was accepted, by channel.
     at_first: Mapping[str, list[Dependence]] = field(default_factory=dict)
@@ -84,6 +87,11 @@ class Selection:
     def touched(self) -> set[str]:
         """Channels whose fit is applied."""
         return {self.channel_of(suspect) for suspect in self.suspects}
+
+    @property
+    def not_recalibrated(self) -> set[str]:
+        """Channels whose recalibration was taken out again, and stays out."""
+        return {channel for channel in self.refused if channel not in self.touched - self.held}
 
     def applied(self, without: str = "") -> dict[Coordinate, float]:
         """What differs from the calibration; ``without`` one suspect, the others where they are."""
@@ -123,6 +131,18 @@ class Selection:
             model = self.model.without(own).refined({candidate.channel})
         refused = replace(candidate, accepted=False, reason=reason)
         return replace(self.noted([refused]), model=model, dropped=self.dropped | {suspect})
+
+    def with_base_held(self, channel: str, reason: str) -> "Selection":
+        """The base parameters of a channel back at the calibration, and its effects refitted to that. Where a log finds its
+        contact is none of the calibration's."""
+        if channel in self.suspects:
+            return self.without(channel, reason)
+        base = [c for c in self.model.own(channel) if not c.effect and c.name != CLEARANCE]
+        model = self.model.entered({c: c.start for c in base}, chosen=base).refined({channel})
+        gain = model.rms(float(np.sum(model.left_out(channel) - self.model.left_out(channel))), channel)
+        left = {c: gained for c, gained in self.recalibrated.items() if c != channel}
+        refused = {**self.refused, channel: (gain, reason)}
+        return replace(self, model=model, recalibrated=left, refused=refused, held=self.held | {channel})
 
     def entered(self, winners: list[Candidate]) -> "Selection":
         """Effects accepted, one for each channel, and refitted; one that leaves its channel worse than before goes out."""

@@ -67,13 +67,17 @@ def _place(port: str, signals: tuple[str, ...]) -> str:
 
 def _told(diagnosis: Diagnosis, finding: Candidate) -> str:
     """A finding with its numbers, and with all that these logs cannot tell from it, which is as much a finding as it is."""
+    numbers = finding.effect.equation if finding.made else size(finding)
+    return f"{title(finding)} ({numbers}{_equals(diagnosis, finding)})"
+
+
+def _equals(diagnosis: Diagnosis, finding: Candidate) -> str:
+    """What is as likely as a finding, and what would tell."""
     if not finding.made:
         [*others] = (f for f in diagnosis.findings if f.effect.name == finding.confounded_with)
-        equals = "".join(f"; or instead {title(f)}, {size(f)}; what would tell: {finding.manoeuvre}" for f in others)
-        return f"{title(finding)} ({size(finding)}{equals})"
+        return "".join(f"; or instead {title(f)}, {size(f)}; what would tell: {finding.manoeuvre}" for f in others)
     others = " or ".join(_place(*place) for place in finding.alike)
-    equals = f"; as likely it is of {others}; what would tell: {finding.manoeuvre}" if others else ""
-    return f"{title(finding)} ({finding.effect.equation}{equals})"
+    return f"; as likely it is of {others}; what would tell: {finding.manoeuvre}" if others else ""
 
 
 def size(finding: Candidate) -> str:
@@ -109,7 +113,8 @@ def verdict(diagnosis: Diagnosis) -> str:
         sentences = [f"No effect beyond the calibration's models is proven{off}"]
     text = f"{'; '.join(sentences)}{': ' if not diagnosis.accepted else '; '}{change}."
     parts = (
-        _worse, _plain, _late, _apart, _dead, _outside, _recalibration, _refused, _no_tolerance, _unexplained, _full, _stated,
+        _worse, _plain, _late, _apart, _dead, _full_torque, _outside, _recalibration, _refused, _withdrawn, _no_tolerance,
+        _unexplained, _full, _stated,
     )  # fmt: skip
     return " ".join([text, *(sentence for part in parts for sentence in part(diagnosis))])
 
@@ -156,6 +161,12 @@ def _dead(diagnosis: Diagnosis) -> list[str]:
     return [told] if dead_A else []
 
 
+def _full_torque(diagnosis: Diagnosis) -> list[str]:
+    """Logs whose brake torque, and the heat that it makes, nothing was judged by."""
+    told = [f"{name}: {what}" for name, what in diagnosis.full_torque.items()]
+    return [f"No brake torque was taken of {'; '.join(told)}."] if told else []
+
+
 def _outside(diagnosis: Diagnosis) -> list[str]:
     """Where a term holds the value of its range's edge, which is no more than a guess there."""
     told = []
@@ -176,6 +187,19 @@ def _refused(diagnosis: Diagnosis) -> list[str]:
         f"Not recalibrated: the {NAMES[channel]}, which would gain {gain:.3g} {UNITS[channel]} on these logs ({reason})."
         for channel, (gain, reason) in diagnosis.refused.items()
     ]
+
+
+def _withdrawn(diagnosis: Diagnosis) -> list[str]:
+    """What these logs prove on its own path, and why it is not applied."""
+    told = []
+    for f in (f for f in diagnosis.findings if f.effect.name in diagnosis.withdrawn and f.channel):
+        gains = f"{f.gain:.3g} {UNITS[f.channel]} of the {NAMES[f.channel]}"
+        numbers = f.effect.equation if f.made else size(f)
+        told.append(
+            f"Proven on these logs but not applied: {title(f)} ({f.reason}), which gains {gains}: "
+            f"{numbers}{_equals(diagnosis, f)}."
+        )
+    return told
 
 
 def _recalibration(diagnosis: Diagnosis) -> list[str]:
@@ -264,15 +288,14 @@ def _left(diagnosis: Diagnosis, left: Left, begin: str) -> list[str]:
         text += f", where {left.fitted:.3g} {unit} are left of the logs in which a term was made for it"
     elif np.isfinite(left.achieved):
         text += f", where {left.achieved:.3g} {unit} are {least_left(diagnosis)}"
-    withdrawn = _withdrawn(diagnosis, left.channel)
     if strongest is None and left.elsewhere:
-        return [f"{text}. What would tell: more such manoeuvres in the logs that are fitted.", *withdrawn]
+        return [f"{text}. What would tell: more such manoeuvres in the logs that are fitted."]
     if strongest is None:
-        return [f"{text}, which depend on no signal that was recorded.", *withdrawn]
+        return [f"{text}, which depend on no signal that was recorded."]
     told = f"{text}, which depend most on {strongest.signal.replace('_', ' ')}"
     if not left.beyond:
         told += f" (by {strongest.rms:.3g} {unit})"
-    return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}.", *withdrawn]
+    return [f"{told}. What would tell: {MANOEUVRES[strongest.signal]}."]
 
 
 def _full(diagnosis: Diagnosis) -> list[str]:
@@ -290,12 +313,6 @@ def least_left(diagnosis: Diagnosis) -> str:
         return "what is noise"
     measured = diagnosis.bench.calibration.provenance is not None
     return "what the calibration achieved on its own data" if measured else "what the calibration states as noise"
-
-
-def _withdrawn(diagnosis: Diagnosis, channel: str) -> list[str]:
-    """What these logs prove on a channel of which something is left, and why it is not applied."""
-    gone = [f for f in diagnosis.findings if f.effect.name in diagnosis.withdrawn and f.channel == channel]
-    return [f"Proven on these logs but not applied: {title(f)} ({f.reason})." for f in gone]
 
 
 def _stated(diagnosis: Diagnosis) -> list[str]:

@@ -19,6 +19,9 @@ from emb_daemon.wire.layout import CORNERS
 CAPACITY = 1 << 14
 #: Time within which a reference's frame is a sample's own, ns: half a cycle.
 _NEAR_NS = 2_000_000
+#: Step of the reference brake torque, N·m, from which its number was full: 0.8 of what its 16 bits hold. A brake that is
+#: turned round at once does not reach both ends of it.
+_FULL_NM = 0.8 * 6553.6
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,19 @@ class Log:
         later = times[nearest(times, self.time_ns)] - self.time_ns if len(times) else np.zeros(0)
         near = np.abs(later) < _NEAR_NS
         return float(np.median(later[near])) if near.any() else 0.0
+
+    @property
+    def full_torque(self) -> str:
+        """What the reference brake torque does where its number was full, in words; nothing if it never was."""
+        torque = self.reference.brake_torque_Nm[np.isfinite(self.reference.brake_torque_Nm)]
+        steps = np.abs(np.diff(torque))
+        if not len(steps) or np.max(steps) <= _FULL_NM:
+            return ""
+        where = int(np.argmax(steps))
+        return (
+            f"the reference brake torque goes from {torque[where]:.4g} to {torque[where + 1]:.4g} N·m at once: its number, "
+            "which ends at 3277 N·m, was full"
+        )
 
     def with_reference_earlier(self, late_s: float) -> "Log":
         """The same with the reference force, which came ``late_s`` after its samples, at its own time."""

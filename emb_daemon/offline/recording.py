@@ -26,9 +26,6 @@ _OFTEN_S = 0.25
 _PLATE_WINDOW_S = 1.0
 #: Steps above this length, s, of logs that last for hours, are not divided further.
 _COARSE_S = 0.5
-#: Step of the reference brake torque, N·m, from which its number was full: 0.8 of what its 16 bits hold. A brake that is
-#: turned round at once does not reach both ends of it.
-_FULL_NM = 0.8 * 6553.6
 
 
 @dataclass(frozen=True)
@@ -147,14 +144,8 @@ def _check(log: Log, channels: list[tuple[np.ndarray, np.ndarray]], has_plates: 
     ):
         if len(times) < 2:
             raise InputError(f"{log.path}: no {what}; needed to identify heat")
-    torque = log.reference.brake_torque_Nm[np.isfinite(log.reference.brake_torque_Nm)]
-    steps = np.abs(np.diff(torque))
-    if np.max(steps) > _FULL_NM:
-        where = int(np.argmax(steps))
-        raise InputError(
-            f"{log.path}: the reference brake torque goes from {torque[where]:.4g} to {torque[where + 1]:.4g} N·m at once: "
-            "its number, which ends at 3277 N·m, was full; a torque within it is needed to identify heat"
-        )
+    if log.full_torque:
+        raise InputError(f"{log.path}: {log.full_torque}; a torque within it is needed to identify heat")
 
 
 def _braking(log: Log, seconds, count: int, step: float) -> np.ndarray:

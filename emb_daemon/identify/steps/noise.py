@@ -33,6 +33,9 @@ from emb_daemon.wire.contract import CYCLE_S
 _SLID = 0.1
 #: Relative error of an extrapolated curve from which a note is written: the usual relative noise of the path.
 _NOTED = 0.01
+#: The same from which angles are of different places: at one angle pads give or take by their relaxation and hysteresis, some
+#: per cent each.
+_OF_OTHER_PLACES = 0.1
 #: Length of the stretches, in samples, from which noise is identified, if there are any that long.
 _LONG = 50
 #: Resolver movement that still counts as standing, rad.
@@ -147,9 +150,14 @@ def _unsure_at_the_end(reached_N: float, rated_N: float, beyond: float) -> str:
         return (
             f"curves: no log clamps harder than {reached}, and a cubic that goes on {told} a slow clamp to the largest force"
         )
+    if beyond > _OF_OTHER_PLACES:
+        return (
+            f"curves: logs clamp up to {reached}, but at angles so unlike that their cubic {told} logs in which the angle "
+            "counts from one place, or one log alone"
+        )
     return (
-        f"curves: logs clamp up to {reached}, but at angles so unlike that their cubic {told} logs in which the angle counts "
-        "from one place, or one log alone"
+        f"curves: logs clamp up to {reached} in motion, but the curve of all of them, without what pads resist motion with, "
+        f"reaches the largest force beyond their angles, and {told} a slow clamp a little beyond the largest force"
     )
 
 
