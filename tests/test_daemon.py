@@ -384,3 +384,15 @@ def test_the_notify_socket_may_be_abstract():
         manager.bind(f"\0{name}")
         ServiceManager({"NOTIFY_SOCKET": f"@{name}"}).notify("READY=1", "STATUS=here")
         assert manager.recv(4096) == b"READY=1\nSTATUS=here"
+
+
+def test_a_service_manager_that_reads_nothing_holds_nothing_up():
+    name = f"emb-daemon-test-deaf-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(f"\0{name}")
+        speaking = ServiceManager({"NOTIFY_SOCKET": f"@{name}"})
+        # More than any queue of datagrams holds.
+        thread = threading.Thread(target=lambda: [speaking.notify("WATCHDOG=1") for _ in range(5000)], daemon=True)
+        thread.start()
+        thread.join(20.0)
+        assert not thread.is_alive()

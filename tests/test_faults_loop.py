@@ -489,6 +489,7 @@ def test_an_interface_that_was_deleted_and_added_again_is_bound_again():
     assert len(bus.drain()) == 0 and len(found) == 1, "not at every tick"
     bus._reopen_ns -= rawcan._REOPEN_NS
     assert bus.drain()["can_id"].tolist() == [0x100] and not bus.down and bus._reopen_ns is None
+    assert old._socket.fileno() == -1, "an interface that comes and goes must not use up the process's descriptors"
     with pytest.raises(OSError, match="Bad file descriptor"):
         bus._failed(errno.EBADF)
 

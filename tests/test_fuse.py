@@ -103,6 +103,15 @@ def test_what_holds_a_standing_motor_is_as_unsure_as_its_friction(p, s, m):
         assert (fuse._standing_sigmas(s, p, m)[1] > 0.0) == swings
 
 
+@pytest.mark.parametrize(("efficiency", "known"), [(0.5, True), (0.1, False)])
+def test_friction_of_a_motion_that_is_known_counts_unless_the_gear_locks_itself(p, s, m, efficiency, known):
+    """Where friction carries nearly all of the load on the way back, how much of it there is decides, and is not known."""
+    s["plausibility"]["steady"], s["spring_force"], s["friction_mean"], s["covariance"] = 0.5, 0.0, -1.0, 0.0
+    s["gear_gain"], p["load_friction"] = 1.0, (1.0 - efficiency) * p["gear_gain"] / s["gear_friction"]
+    sure, unsure = (fuse._torque_beside_motion(s, p, m, variance) for variance in (0.0, 1.0))
+    assert (sure[1] < 0.1 * unsure[1]) == known and (sure == unsure) != known
+
+
 def test_a_torque_beside_a_known_motion_is_as_unsure_as_what_it_is_made_of(p, s, m):
     """Offset, torque constant, both frictions and the viscous one, each alone; 0.5 N m at 40 rad/s."""
     s["plausibility"]["steady"], s["spring_force"] = 0.5, 0.0

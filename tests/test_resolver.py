@@ -179,6 +179,20 @@ def test_a_speed_that_is_again_what_it_was_before_a_wrong_message_is_believed(si
     assert s["speed_wrong"] == wrong and (m["speed"] == -0.3) != wrong
 
 
+@pytest.mark.parametrize(
+    ("turned", "was_wrong", "believed"),
+    [(0.1, False, "last"), (0.1, True, "angle"), (0.4, True, "angle"), (0.7, True, "last")],
+)
+def test_instead_of_a_speed_that_no_motor_has_the_last_goes_on_and_then_what_the_angle_says(turned, was_wrong, believed):
+    """Of the angle only a speed that a motor gains within a cycle; shares of the largest speed."""
+    p, s, m = to_parameters(shipped_calibration()), new_state()[0], city.drive()[0][:1].copy()[0]
+    s["angle"], s["speed"], s["speed_wrong"], s["away"]["seconds"] = m["angle"], 0.0, was_wrong, 1.0
+    m["dt"], m["speed"] = 0.004, 3.0 * p["maximum_speed"]
+    m["angle"] += turned * p["maximum_speed"] * m["dt"]
+    resolver.believe_speed(s, p, m)
+    assert s["speed_wrong"] and m["speed"] == pytest.approx(turned * p["maximum_speed"] if believed == "angle" else 0.0)
+
+
 @pytest.mark.parametrize(("samples_away", "known"), [(5, True), (100, False)])
 def test_a_zero_that_comes_back_had_never_moved_if_it_does_so_within_some_messages(samples_away, known):
     begin = city.HOLDING

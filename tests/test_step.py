@@ -13,6 +13,7 @@ from emb_daemon.estimator.unknown import add_softening, set_priors
 from emb_daemon.models.fusion import CONTACT, OF_THE_MODEL, SCALE, STATES, maximum_likelihood
 from emb_daemon.models.gear import steepest, through_gear
 from emb_daemon.models.stiffness import characteristic_curve
+from emb_daemon.models.thermal import stiffness_factor
 from emb_daemon.offline import estimate
 from emb_daemon.wire import contract as r
 
@@ -149,6 +150,26 @@ def test_a_motor_that_stands_shows_the_noise_of_its_speed(p):
     assert standing(p, speeds[:40]) < 0.4 * noise
     assert standing(p, 0.1 * p["speed_sigma"] * np.sign(speeds)) == p["speed_sigma"]
     assert standing(p, speeds, turned_rad=0.004 * noise) == p["speed_sigma"]
+
+
+def test_the_stiffness_that_is_told_is_of_softening_and_of_other_pads_together(p):
+    """Pads that soften by a twentieth and are a fifth stiffer than the calibration's."""
+    state, out = new_state()[0], np.zeros(1, ESTIMATE)[0]
+    step(state, p, row(temperature=120.0), out)
+    state["scale"] = 1.2
+    step(state, p, row(dt=0.004, temperature=120.0), out)
+    softened = stiffness_factor(p["thermal"], *(120.0 - p["thermal"]["reference"],) * 2)
+    assert softened < 0.95 and out["stiffness_factor"] == pytest.approx(1.2 * softened, rel=0.01)
+
+
+@pytest.mark.parametrize("pause_s", [0.3, 1.0])
+def test_a_sample_after_a_pause_tells_noise_for_all_of_it_and_not_for_more(p, pause_s):
+    state, out, noise = new_state()[0], np.zeros(1, ESTIMATE)[0], 10.0 * p["speed_sigma"]
+    for number in range(200):
+        step(state, p, row(3.0, 0.004 * (number > 0), noise * (-1.0) ** number), out)
+    shown = float(state["speed_square"])
+    step(state, p, row(3.0, pause_s, noise), out)
+    assert state["speed_square"] == pytest.approx(shown + min(pause_s / 0.5, 1.0) * (noise**2 - shown))
 
 
 def test_a_motor_that_has_just_stopped_shows_none_yet(p):

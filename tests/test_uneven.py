@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from emb_daemon.estimator import fuse, step, uneven
+from emb_daemon.estimator.phases import OPEN_PHASES, follow_phases, undecided, weigh_phases
 from emb_daemon.estimator.records import ESTIMATE, new_state
 from emb_daemon.estimator.status import DISC_UNEVEN
 from emb_daemon.offline import estimate
@@ -279,6 +280,20 @@ def test_a_lost_phase_begins_anew(u, p):
     assert np.sqrt(u["covariance"][0, 0]) > 10e-6
 
 
+def test_while_the_counter_is_silent_the_speed_carries_the_phase_on(u, p):
+    row = brake.samples(p, np.zeros(2))[0][1]
+    row["wheel_speed"], row["wheel_pulse"] = _TURNING, 100.0
+    for _ in range(3):
+        uneven.turn(u, row, _SLOPE, p["gear_gain"], 1e-6)
+    begun = np.arctan2(u["drive"][1], u["drive"][0])
+    row["has_wheel_pulse"] = False
+    for number in range(1, 26):
+        uneven.turn(u, row, _SLOPE, p["gear_gain"], 1e-6)
+        angle = begun + number * 0.004 * _TURNING
+        expected = _SLOPE / p["gear_gain"] * np.array([np.cos(angle), np.sin(angle), np.cos(2.0 * angle), np.sin(2.0 * angle)])
+        assert u["drive"] == pytest.approx(expected, abs=1e-6 * _SLOPE / p["gear_gain"])
+
+
 def test_without_counter_and_speed_the_phase_is_lost_at_once(u, p):
     _feed(u, p, 1e-6 * np.array([12.0, 0.0, 0.0, 0.0]), 6.0)
     rows = brake.samples(p, np.zeros(3))[0][1:]
@@ -390,3 +405,52 @@ def test_each_order_is_told_by_how_far_it_moves_the_force_over_a_turn(u, order):
         u["force"] = [_SLOPE / 4e-5 * part(k * angle) for k in (1, 2) for part in (np.cos, np.sin)]
         assert uneven.unproven(u) == pytest.approx(0.3 * _SLOPE * 10e-6 / 4e-5)
         assert uneven.way_per_rad(u) == pytest.approx(0.3 * 2.0 / np.pi * order * _SLOPE * 10e-6 / 4e-5)
+
+
+# The phases of a disc that the calibration knows.
+
+
+@pytest.fixture
+def phases():
+    """States of the effects with three open phases, and what each does to the force."""
+    s, o = new_state()[0]["effects"], np.zeros(1, OPEN_PHASES)[0]
+    s["disc_thickness_variation"]["likely"] = 0.5, 0.3, 0.2
+    s["disc_thickness_variation"]["beside"] = 1e-5, -4e-6, -1.9e-5
+    return o, s
+
+
+def test_an_open_phase_moves_the_force_by_its_thickness_with_the_pads_lag(phases, p):
+    o, s = phases
+    row = brake.samples(p, np.zeros(2))[0][1]
+    expected = _SLOPE / p["gear_gain"] * s["disc_thickness_variation"]["beside"]
+    follow_phases(o, s, row, _SLOPE, p["gear_gain"], 0.04)
+    assert o["drive"] == pytest.approx(expected)
+    assert np.all(np.abs(o["force"]) < 0.1 * np.abs(expected)) and np.all(o["force"] * expected > 0.0)
+    for _ in range(100):
+        follow_phases(o, s, row, _SLOPE, p["gear_gain"], 0.04)
+    assert o["force"] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("right", range(3))
+def test_open_phases_are_as_likely_as_bayes_rule_says(phases, right):
+    """The torque is that of one of them, and a sigma and a half of noise; what all are far from speaks for none."""
+    o, s = phases
+    o["force"], variance = (700.0, -200.0, -500.0), (400.0 * _LEVERAGE) ** 2
+    priors, without = np.array([0.5, 0.3, 0.2]), _LEVERAGE * (o["force"][right] + 600.0)
+    weigh_phases(o, s, _LEVERAGE, without, variance)
+    odds = priors * np.exp(-0.5 * (without - _LEVERAGE * o["force"]) ** 2 / variance)
+    assert s["disc_thickness_variation"]["likely"] == pytest.approx(odds / odds.sum())
+    weigh_phases(o, s, _LEVERAGE, _LEVERAGE * 1e5, variance)
+    assert s["disc_thickness_variation"]["likely"] == pytest.approx(odds / odds.sum())
+
+
+def test_a_phase_that_was_believed_by_mistake_is_left_again(phases):
+    """However long it was believed, some torques are enough."""
+    o, s = phases
+    o["force"], variance = (700.0, -200.0, -500.0), (400.0 * _LEVERAGE) ** 2
+    for _ in range(1000):
+        weigh_phases(o, s, _LEVERAGE, _LEVERAGE * 700.0, variance)
+    assert not undecided(s) and s["disc_thickness_variation"]["likely"][0] > 0.9999
+    for _ in range(20):
+        weigh_phases(o, s, _LEVERAGE, _LEVERAGE * -500.0, variance)
+    assert s["disc_thickness_variation"]["likely"][2] > 0.99

@@ -196,6 +196,20 @@ def test_a_contact_angle_that_was_placed_anew_tells_nothing_of_the_zero(p, place
     assert s["straying"]["strayed"] == 0.0 and s["straying"]["known"] == 0.01
 
 
+@pytest.mark.parametrize("zero_rad", [-4.0, 0.0, 150.0])
+def test_what_a_stop_tells_of_the_zero_is_the_same_wherever_the_zero_is(p, zero_rad):
+    """It moved by all that has strayed, whatever the resolver reads there; and the zero of another power-on is no straying."""
+    s, a = (state := new_state()[0]), state["straying"]
+    s["gear_slope"], s["covariance"][CONTACT, CONTACT], s["clearance"] = 1.0, 0.01, p["clearance"]
+    s["contact_angle"] = s["contact_anchor"] = p["clearance"]
+    attribute_straying(s)
+    s["contact_angle"] += zero_rad
+    s["contact_anchor"] += zero_rad
+    a["strayed"], s["contact_angle"] = 0.5, s["contact_angle"] + 0.5
+    attribute_straying(s)
+    assert a["share"] == pytest.approx(0.86, abs=0.01)
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("rad_per_s", [-0.1, -0.067, 0.1])
 def test_an_angle_that_creeps_while_brakes_are_open_drifts_whatever_the_offset_of_the_speed(p, rad_per_s, seed):

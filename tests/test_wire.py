@@ -458,6 +458,15 @@ def test_a_dbc_of_ones_own_is_read_in_its_units(tmp_path, unit, factor, offset, 
     assert (signal["low"], signal["high"]) == (pytest.approx(-80000 * per_unit), pytest.approx(80000 * per_unit))
 
 
+def test_temperatures_of_a_dbc_of_ones_own_may_be_absolute(tmp_path):
+    """Value and range of 0.1 K a bit from 200 K."""
+    line = next(line for line in resource("dbc/emb.dbc").read_text().splitlines() if "SG_ InnerBackplateTemp" in line).strip()
+    kelvin = re.sub(r"\(.*?\) \[.*?\]", "(0.1,200) [220|1400]", line).replace('"degC"', '"K"')
+    signal = load_layout(_altered(tmp_path, (line, kelvin)))[0]["received"][wire.THERMOCOUPLE, wire.INNER_BACKPLATE]
+    assert unpack(np.uint64(1000) << np.uint64(signal["start"]), signal) == pytest.approx(300.0 - 273.15)
+    assert (signal["low"], signal["high"]) == (pytest.approx(220.0 - 273.15), pytest.approx(1400.0 - 273.15))
+
+
 @pytest.mark.parametrize(
     ("unit", "target", "value"),
     [("Degrees", "rad", np.pi / 180.0), ("U/min", "rad/s", np.pi / 30.0), ("U", "rad", 2.0 * np.pi), ("KPH", "m/s", 1.0 / 3.6),
