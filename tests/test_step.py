@@ -275,8 +275,8 @@ def test_a_step_of_the_current_of_a_motor_that_stands_is_no_noise(parameters):
 
 
 def _slipped(p, before, angle):
-    """ESTIMATE rows and true force of a motor that goes through the ``angle`` (rad) while the rotor of its resolver stands where
-    it was after the rows ``before``; what it shows is noise."""
+    """ESTIMATE rows and true force of a motor that goes through the ``angle`` (rad) while the rotor of its resolver stands
+    where it was after the angles ``before``; what it shows is noise."""
     rows, force = brake.samples(p, np.concatenate([before, angle]))
     rows, rng, begun = brake.noisy(rows, p), np.random.default_rng(3), len(before)
     rows["angle"][begun:] = rows["angle"][begun] + 1e-3 * rng.standard_normal(len(angle))
