@@ -256,7 +256,7 @@ def _authenticated(frames: np.ndarray, seed: int, count: int) -> None:
     print("|---|---|---|---|---|")
     for name, total in totals.items():
         print("| {} | {} | {} | {} | {} |".format(name, *total))
-    print("| together | {} | {} | {} | {} |".format(*sum(totals.values())))
+    print("| all together | {} | {} | {} | {} |".format(*sum(totals.values())))
 
 
 def _cost(seed: int) -> None:

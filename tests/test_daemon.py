@@ -355,6 +355,8 @@ def test_a_bus_is_disturbed_for_a_second_by_lost_frames_and_error_frames_and_by_
     assert disturbed(5 * second)
     frames["flags"][1] = EXTENDED
     assert not disturbed(7 * second)
+    daemon._bus.unsent += 1
+    assert disturbed(8 * second), "the bus took no frame of ours"
 
 
 def test_the_watchdog_is_pinged_while_every_corner_is_estimated_and_most_ticks_are_met(setup: Setup, caplog):

@@ -95,6 +95,10 @@ def test_it_belongs_to_one_corner_actuator_and_calibration(tmp_path):
     for other in (adaptkit.shipped(actuator="another"), adaptkit.shipped(pad_thickness_mm=9.0)):
         found, _, warning = snapshots.load("FL", other)
         assert found is None and "not used" in warning and snapshots.path("FL").exists()
+    # An actuator's name may be that of its type, and all corners have the same calibration.
+    snapshots.path("FR").write_bytes(snapshots.path("FL").read_bytes())
+    found, _, warning = snapshots.load("FR", SHIPPED)
+    assert found is None and "belongs to corner FL" in warning
 
 
 @pytest.mark.parametrize("content", [b"[" * 200_000, b'{"a":' + b"9" * 5000 + b"}", b"{}", b"\xff" * 100])
