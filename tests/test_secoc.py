@@ -31,7 +31,7 @@ from emb_daemon.wire.cmac import KEY, cmac, new_key
 from emb_daemon.wire.contract import CYCLE_NS
 from emb_daemon.wire.frames import FRAME, UNAUTHENTIC
 from emb_daemon.wire.keys import key_file, load_keys
-from emb_daemon.wire.secoc import FRESHNESS_SET, Signer, Verifier, load_links
+from emb_daemon.wire.secoc import FRESHNESS_SET, LAST_MESSAGE, LAST_RESET, Signer, Verifier, load_links
 from studies import attacks
 
 RECEIVED, SENT = load_links(corners=("FL",))
@@ -498,6 +498,13 @@ def test_signed_frames_are_accepted_by_a_receiver_with_the_key(tmp_path):
 def opened(folder):
     file = FreshnessFile(folder)
     return Authentication(RECEIVED, SENT, KEYS, file.begin_trip(), file)
+
+
+def test_a_sender_whose_counters_are_used_up_authenticates_nothing_more():
+    """A freshness value that came twice could be played back."""
+    payloads = [(RECEIVED[0].sets[1][0], 0x1200)]
+    for reset, frames in ((LAST_RESET - 1, 4), (LAST_RESET, 1)):
+        assert len(answer_to(1, reset, LAST_MESSAGE, payloads)) == frames
 
 
 class TestFreshnessFile:

@@ -620,3 +620,13 @@ def test_a_motor_that_opens_further_than_where_it_stood_at_power_on_was_not_rele
     estimates = estimate(brake.noisy(rows, p), p)
     assert _covered(estimates[350:], force[350:])
     assert estimates["contact_angle"][449] == pytest.approx(p["clearance"], abs=0.3)
+
+
+@pytest.mark.parametrize("elapsed_s", [0.0, 45.0, 600.0])
+def test_a_motor_cools_while_nobody_watches_it(parameters, elapsed_s):
+    """Its winding within half a minute, its housing within five minutes (e-fold)."""
+    s = new_state()[0]
+    s["winding"], s["housing"] = 0.8, 0.5
+    restart.rest_unwatched(s, parameters[0], elapsed_s)
+    assert s["winding"] == pytest.approx(0.8 * np.exp(-elapsed_s / 30.0))
+    assert s["housing"] == pytest.approx(0.5 * np.exp(-elapsed_s / 300.0))
