@@ -375,6 +375,14 @@ def test_a_frame_is_half_a_cycle_early_at_most_at_any_time(early_ms):
     assert verdict == (ACCEPTED if early_ms < 2.0 else BAD_COUNTER)
 
 
+def test_after_a_long_silence_128_frames_show_the_schedule_again():
+    """Who comes early then is refused as before the silence of 1.6 s."""
+    receptions, begin_ns = new_reception(), 3 * 10**17
+    for cycle in (*range(300), *range(700, 900)):
+        assert _receive(_resolver(cycle % 15, begin_ns + 4 * MS * cycle), receptions)[1] == ACCEPTED
+    assert _receive(_resolver(0, begin_ns + 3600 * MS - round(2.1 * MS)), receptions)[1] == BAD_COUNTER
+
+
 @pytest.mark.parametrize("shown", [40, 300], ids=["before a window is full", "after it"])
 def test_a_frame_is_as_late_as_it_comes_after_the_promptest(shown):
     """Also if the first of all was late; and after a silence, of which the schedule knows no whole turns of the counter."""
