@@ -311,6 +311,27 @@ def test_hot_disc_brings_contact_earlier_and_wear_brings_it_later():
     assert (force(with_effect("pad_wear", wear_um_per_MJ=50.0), samples) - plain)[-1] < -5.0
 
 
+def test_pads_that_yield_press_less_the_longer_they_are_held():
+    """Exponentially, from an excess that is the element's share of the static force. Over a stroke to and fro they take work:
+    a Maxwell element is passive."""
+    rows = np.zeros(4000, SAMPLE)
+    p, q = with_effect("stress_relaxation", share=0.1, time_constant_s=0.5), bare()
+    for record in (p, q):
+        record["relaxation_time"] = 0.0
+    rows["dt"][1:], rows["has_current"] = DT, False
+    reached = p["clearance"] + 10.0
+    rows["angle"] = np.concatenate([np.zeros(500), np.full(2500, reached), np.linspace(reached, 0.0, 1000)])
+    excess = force(p, rows) - force(q, rows)
+    static = force(q, rows)[2999]
+    held_s = DT * np.arange(1, 2000)
+    assert excess[501:2500] == pytest.approx(0.1 * static * np.exp(-held_s / 0.5), abs=0.01 * static)
+    stroke = rows[:2000].copy()
+    stroke["angle"] = 0.5 * reached * (1.0 - np.cos(2.0 * np.pi * np.arange(2000) / 2000))
+    stroke["speed"] = np.gradient(stroke["angle"], DT)
+    work, elastic = (np.trapezoid(force(record, stroke), stroke["angle"]) for record in (p, q))
+    assert work > 10.0 * abs(elastic) and work > 0.01 * static
+
+
 def test_backlash_is_lost_only_after_a_reversal():
     samples = drive()
     change = force(with_effect("backlash", play_rad=0.2), samples) - force(bare(), samples)

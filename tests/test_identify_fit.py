@@ -135,6 +135,27 @@ def test_one_more_relaxation_is_taken_in_where_it_is_and_only_there(there):
             assert abs(found.values[key] - value) < 4.0 * found.sigmas[key]
 
 
+@pytest.mark.trial
+def test_pads_that_yield_are_told_from_pads_that_lag():
+    """Force that falls at a held angle, over two decades of time, instead of rising: neither a lag nor a loop describes it."""
+    rng = np.random.default_rng(13)
+    truth = draw(rng, thicknesses=(6.0,))
+    own = {
+        "effects.stress_relaxation.share": 0.04,
+        "effects.stress_relaxation.time_constant_s": 0.08,
+        "effects.slow_stress_relaxation.share": 0.03,
+        "effects.slow_stress_relaxation.time_constant_s": 3.0,
+    }
+    loop = {key: value for key, value in truth.dynamics.items() if "hysteresis" in key}
+    truth.dynamics = {RELAXATION: 1e-4} | loop | own
+    found = stiffness.identify(pads(truth, rng), truth.nominal())
+    names = {effect.name for effect in found.chosen.effects}
+    assert names == {"stiffness_hysteresis", "stress_relaxation", "slow_stress_relaxation"}
+    assert found.fit.rms == pytest.approx(truth.reference_noise_N, rel=0.05)
+    for key, value in own.items():
+        assert abs(found.values[key] - value) < 4.0 * found.sigmas[key]
+
+
 def test_the_free_regression_is_exact_on_data_of_its_form():
     """Thesis 3.4's own difference equation, computed here without the estimator's kernels."""
     rng = np.random.default_rng(11)

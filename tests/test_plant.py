@@ -43,6 +43,8 @@ VISIBLE = {
     "second_hysteresis": {"share": 0.05, "slip_angle_rad": 0.3},
     "second_relaxation": {"share": 0.2, "time_constant_s": 1.0},
     "third_relaxation": {"share": 0.1, "time_constant_s": 6.0},
+    "stress_relaxation": {"share": 0.05, "time_constant_s": 0.3},
+    "slow_stress_relaxation": {"share": 0.05, "time_constant_s": 6.0},
     "signal_delay": {"delay_s": 0.003},
     "backlash": {"play_rad": 0.2},
     "friction_coefficient_fade": {"fade_per_K": 0.003, "onset_C": 30.0},

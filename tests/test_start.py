@@ -239,12 +239,14 @@ def test_a_log_at_a_reduced_rate_that_begins_on_the_way_has_its_released_positio
 
 
 @pytest.mark.parametrize("begins", ["released", "clamped"])
-def test_what_pads_may_remember_of_a_stop_before_the_start_is_covered_until_they_have_forgotten_it(p, begins):
+@pytest.mark.parametrize(("effect", "way"), [("second_relaxation", 1.0), ("stress_relaxation", -1.0)])
+def test_what_pads_may_remember_of_a_stop_before_the_start_is_covered_until_they_have_forgotten_it(p, effect, way, begins):
     """They relax over three seconds, and the power comes as a stop of a quarter of the largest force ends, or within it."""
-    p["effects"]["second_relaxation"]["share"], p["effects"]["second_relaxation"]["time_constant_s"] = 0.1, 3.0
+    p["effects"]["second_relaxation"]["share"] = 0.0
+    p["effects"][effect]["share"], p["effects"][effect]["time_constant_s"] = 0.1, 3.0
     top = p["clearance"] + travel_at(0.25 * p["maximum_force"], p["curve"])
     up, held, released = top * np.linspace(0.0, 1.0, 100), np.full(2000, top), np.zeros(10_000)
-    rows, force = brake.samples(p, np.concatenate([up, held, up[::-1], released]), creep=(0.1, 3.0))
+    rows, force = brake.samples(p, np.concatenate([up, held, up[::-1], released]), creep=(0.1 * way, 3.0))
     rows["brake_request"][: len(rows) - len(released)] = 4000.0
     first = len(rows) - len(released) + (25 if begins == "released" else -400)
     rows, force = brake.noisy(rows, p)[first:], force[first:]

@@ -30,6 +30,8 @@ _NAMES = (
     "second_hysteresis",
     "second_relaxation",
     "third_relaxation",
+    "stress_relaxation",
+    "slow_stress_relaxation",
     "signal_delay",
     "backlash",
     "friction_coefficient_fade",

@@ -93,7 +93,14 @@ class CurveFit:
 
     def force_sigma(self, x: np.ndarray) -> np.ndarray:
         """Its standard deviation from the covariance of the coefficients."""
-        basis = powers(x, len(self.coefficients))
+        return self._sigma(powers(x, len(self.coefficients)))
+
+    def rise_sigma(self, start_rad: float, end_rad: float) -> float:
+        """Standard deviation, N, of what the force rises by between two travels past contact."""
+        start, end = powers(np.array([start_rad, end_rad]), len(self.coefficients))
+        return float(self._sigma((end - start)[np.newaxis])[0])
+
+    def _sigma(self, basis: np.ndarray) -> np.ndarray:
         return np.sqrt(np.einsum("ti,ij,tj->t", basis, self.covariance, basis))
 
 

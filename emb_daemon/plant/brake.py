@@ -259,6 +259,12 @@ def clamp(p: Record, s: Record) -> None:
         before, s.settled = s.settled, excitation
         s.slower = _settle(s.slower, before, s.settled, e.third_relaxation.time_constant_s)
         excitation += e.third_relaxation.share * (s.slower - s.settled)
+    if e.stress_relaxation.share != 0.0:
+        s.yielding = _settle(s.yielding, s.drive, drive, e.stress_relaxation.time_constant_s)
+        excitation += e.stress_relaxation.share * (drive - s.yielding)
+    if e.slow_stress_relaxation.share != 0.0:
+        s.yielding_slowly = _settle(s.yielding_slowly, s.drive, drive, e.slow_stress_relaxation.time_constant_s)
+        excitation += e.slow_stress_relaxation.share * (drive - s.yielding_slowly)
     if e.clamp_creep.share != 0.0:
         s.creep = _settle(s.creep, s.drive, drive, e.clamp_creep.time_constant_s)
         excitation += e.clamp_creep.share * (s.creep - drive)

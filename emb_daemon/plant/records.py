@@ -134,7 +134,8 @@ PLANT_STATE = np.dtype(
     [
         *fields("f8", "angle speed current friction"),
         # Clamp: backlash output, travel past contact, slip elements, drives of the relaxations and their states.
-        *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower creep motor_heat fastest"),
+        *fields("f8", "driven_angle past_contact slip further_slip drive slow settled slower yielding yielding_slowly creep"),
+        *fields("f8", "motor_heat fastest"),
         # Amounts that drawn effects with a lag add.
         ("drawn", [(place, fields("f8", "amount")) for place in DRAWN]),
         *fields("f8", "excitation force force_rate static_force stiffness_factor"),

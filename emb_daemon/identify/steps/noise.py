@@ -130,14 +130,15 @@ def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign, fastest_rad_per_s
 
 
 def _extrapolation(stiffness: StiffnessStep, rated_N: float) -> float:
-    """Relative error, at the brake's largest force, of curves that were not measured up to it."""
+    """Relative error that curves which were not measured up to the brake's largest force have there beyond the one at their
+    last travel: that one the errors on other logs contain."""
     worst = 0.0
     for curve in stiffness.fit.curves:
         if rising_force(curve.coefficients) < rated_N:
             return 1.0
         travel = travel_at(rated_N, curve.coefficients)
         if travel > curve.travel_rad:
-            worst = max(worst, float(curve.force_sigma(np.array([travel]))[0]) / rated_N)
+            worst = max(worst, curve.rise_sigma(curve.travel_rad, travel) / rated_N)
     return min(worst, 1.0)
 
 
