@@ -77,6 +77,23 @@ def _deviations(seed):
     return found
 
 
+@pytest.mark.parametrize("measured", [0.98, 0.7, 0.4])
+def test_a_curve_is_as_unsure_beyond_its_last_travel_as_what_it_rises_by_there(measured):
+    """Coefficients whose errors cancel where the logs were: what they leave of the force at the last travel is in the errors
+    on other logs, and the rest of the way to the largest force is all that sigma has to grow by."""
+    reached, rated_N = measured * 20.0, 20e3
+    x = np.linspace(0.1, reached, 400)
+    curve = np.array([200.0, 20.0, 1.0])
+    seen = np.linalg.inv(powers(x).T @ powers(x)) * 50.0**2 * 40.0
+    fit = CurveFit(8.0, curve, seen, np.zeros(1), np.ones(1), reached)
+    drawn = np.random.default_rng(1).multivariate_normal(curve, seen, 4000)
+    rise = drawn @ (powers(np.array([20.0])) - powers(np.array([reached])))[0]
+    sigma = noise._extrapolation(SimpleNamespace(fit=SimpleNamespace(curves=[fit])), rated_N)
+    assert sigma == pytest.approx(np.std(rise) / rated_N, rel=0.05)
+    whole = float(fit.force_sigma(np.array([20.0]))[0]) / rated_N
+    assert (sigma < 0.4 * whole) == (measured > 0.9)
+
+
 def test_a_datasheet_that_is_nearly_certain_is_believed_and_a_contradiction_is_told():
     rng = np.random.default_rng(31)
     truth = draw(rng)
