@@ -171,6 +171,8 @@ class Effect:
         placebos: disturbances that must destroy the finding.
         harmonic: how its shape is searched, if it is a harmonic of the motor angle.
         beside: effect of which it is an additional element, and without which it is not tried.
+        opposes: effect that does the opposite, so that a first fit, which knows of neither, tries one of the two: together
+            they make up for each other.
         bare: whether it is tried only on an actuator that clamps nothing.
         measure: (SAMPLE rows of a log) → the amplitude and its standard deviation as signals alone tell them, without a model
             of the brake. A search begins from there: from nothing no line leads to what is many samples away.
@@ -188,6 +190,7 @@ class Effect:
     placebos: tuple[Placebo, ...] = ()
     harmonic: Harmonic | None = None
     beside: str = ""
+    opposes: str = ""
     bare: bool = False
     measure: Callable[[np.ndarray], tuple[float, float]] | None = None
 

@@ -30,4 +30,5 @@ EFFECT = Effect(
     state=STATE,
     signal="time_clamped",
     manoeuvre="clamp hard and hold the motor: the force falls with the time constant",
+    opposes="second_relaxation",
 )

@@ -28,6 +28,8 @@ DELAY = "reference delay"
 _STATIC = tuple(effect for effect in REGISTRY if effect.hook in ("stiffness", "force"))
 OPTIONAL = tuple(effect for effect in _STATIC if not effect.beside)
 FURTHER = tuple(effect for effect in _STATIC if effect.beside)
+#: Those of the former that none of them opposes.
+_USUAL = tuple(effect for effect in OPTIONAL if not effect.opposes)
 #: Starting values of these effects' time constants over that of the lag, and of their angles over the travel; by unit, those
 #: of a further element over those of the first.
 _TIMES, _SHARE_OF_TRAVEL = 10.0, 0.05
@@ -272,7 +274,7 @@ def regress_free(log: Log, x: np.ndarray) -> tuple[np.ndarray, float]:
     return solution[:-1] / span / (1.0 - decay), -cycle / np.log(decay)
 
 
-def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[Effect, ...] = OPTIONAL) -> Calibration:
+def starting_point(groups: list[Pads], calibration: Calibration, effects: tuple[Effect, ...] = _USUAL) -> Calibration:
     """Where a search for curves and dynamics starts: thesis 3-5 for curves and time constant, the rest by proportion."""
     logs = [log for pads in groups for log in pads.logs]
     # Slow logs hardly show the lag; they are used only if there are no others.

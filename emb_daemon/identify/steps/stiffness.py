@@ -97,7 +97,7 @@ class StiffnessStep(Step):
 def identify(pads: list[Pads], nominal: Calibration) -> StiffnessStep:
     """Curves, dynamics and effects. ``pads``: in ascending order of thickness, for each of which ``nominal`` has a curve."""
     effects = [combination for count in range(len(OPTIONAL) + 1) for combination in combinations(OPTIONAL, count)]
-    candidates = [_candidate(pads, nominal, combination) for combination in effects]
+    candidates = [_candidate(pads, nominal, combination) for combination in effects if not _opposed(combination)]
     left_out = all(own.random or len(own.logs) > 1 for own in pads)
     worth = _WORTH if left_out else _WORTH_SEEN
     chosen = _choose(candidates, worth)
@@ -167,6 +167,11 @@ def _candidate(groups: list[Pads], nominal: Calibration, effects: tuple[Effect, 
     return Candidate(effects, fit, held_out, all(fit.value(a) > _CLEAR * fit.sigmas[a] for a in amplitudes))
 
 
+def _opposed(effects: tuple[Effect, ...]) -> bool:
+    names = [effect.name for effect in effects]
+    return any(effect.opposes in names for effect in effects)
+
+
 def _further(chosen: Candidate) -> list[Effect]:
     """Effects that are one more element beside one that was chosen."""
     names = [effect.name for effect in chosen.effects]
@@ -194,8 +199,8 @@ def section(page: Page, step: StiffnessStep) -> None:
     dynamics = page.section(
         "Dynamic stiffness",
         "Output-error fit of the estimator's own stiffness path over all pads at once. Effects are tried in every combination "
-        "on the first halves of the random logs, then one more element beside what is kept; kept is what lowers the error "
-        "of the second halves by more than 2 % and whose amplitude stands clear of zero by three sigma. Without random logs "
+        "without opposites on the first halves of the random logs, then one more element beside what is kept; kept is what "
+        "lowers the error of the second halves by more than 2 % and whose amplitude stands clear of zero by three sigma. Without random logs "
         "each slow log is predicted from the others of its pads; of a single one an effect has to explain a fifth.",
     )
     _dynamics_tables(dynamics, step)
