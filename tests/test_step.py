@@ -64,6 +64,24 @@ def test_what_is_not_known_of_cold_pads_softening_is_in_their_stiffness(p, tempe
     assert (expected[SCALE, SCALE] > 1.2 * known) == (temperature < 0.0)
 
 
+@pytest.mark.parametrize("sigma_per_K", [0.0, 5e-4])
+def test_hot_pads_whose_softening_no_log_has_shown_are_covered(shipped_setup, sigma_per_K):
+    """They are 130 K warmer than those of the calibration and 7 % softer. Without it sigma is that of any brake that nobody
+    has seen braking, and the force is farther off than that."""
+    p = brake.ideal(shipped_setup.parameters)
+    p["thermal"]["softening"] = p["thermal"]["softening_history"] = 0.0
+    p["thermal"]["softening_sigma"] = sigma_per_K
+    soft = p.copy()
+    soft["curve"] *= 0.93
+    rows, force = brake.samples(soft, brake.clamp(soft, 14.0, 1.0))
+    for name in ("inner_backplate", "outer_backplate", "caliper"):
+        rows[name] = p["thermal"]["reference"] + 130.0
+    estimates = estimate(rows, p)
+    first = (force > 1000.0) & (np.arange(len(rows)) < np.argmax(force))
+    apart = np.abs(estimates["force"] - force)[first] / estimates["sigma"][first]
+    assert (apart.max() < 1.0) == (sigma_per_K > 0.0)
+
+
 @pytest.fixture(scope="module")
 def clamp(shipped_setup):
     """Rows, force and estimates of an ideal brake that clamps within a second."""

@@ -285,6 +285,8 @@ class Softening(Struct, kw_only=True):
     history_per_K: Annotated[float, usual(1e-3)] = 0.0
     #: Time constant of that lag.
     history_time_s: Positive = 1000.0
+    #: Standard deviation of `per_K`: what no log has shown.
+    sigma_per_K: Annotated[NonNegative, usual(5e-4)] = 0.0
 
 
 class Thermal(Struct, kw_only=True):
@@ -496,6 +498,7 @@ def _fill_thermal(t: np.void, thermal: Thermal, pad_thickness_m: float) -> None:
     t["softening"] = thermal.softening.per_K
     t["softening_history"] = thermal.softening.history_per_K
     t["history_time"] = thermal.softening.history_time_s
+    t["softening_sigma"] = thermal.softening.sigma_per_K
     t["reference"] = thermal.softening.reference_C
     t["sigma"] = thermal.sigma_K
 

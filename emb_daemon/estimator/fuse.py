@@ -33,7 +33,16 @@ from emb_daemon.estimator.hypotheses import (
     weigh,
     weigh_step,
 )
-from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, SELF_LOCKING, crept, disc_warmth
+from emb_daemon.estimator.paths import (
+    CYCLE_S,
+    DISSOLVING_PER_S,
+    FLICKER_RAD,
+    ONE_CYCLE_S,
+    SELF_LOCKING,
+    crept,
+    disc_warmth,
+    pads_rise,
+)
 from emb_daemon.estimator.phases import follow_phases, undecided, weigh_phases
 from emb_daemon.estimator.rewind import keep
 from emb_daemon.estimator.status import (
@@ -205,7 +214,8 @@ def _predict(s, p, m, spread, warmth, known):
     noise = current_torque * current_torque
     decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
     walked = s.sensitivity[1]
-    softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
+    rise = pads_rise(s, p.thermal) if s.temperature_known else 0.0
+    softening = softening_sigma(p, rise, s.temperature_sigma, s.history_sigma)
     set_walks(walked, p, s.error, s.covariance, s.winding, s.housing, softening, s.power, s.offset_walk, m.dt)
     walked[CONTACT] += s.contact_walk * m.dt
     s.straying.gained += walked[CONTACT]

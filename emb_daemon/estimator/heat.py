@@ -6,6 +6,7 @@ import numpy as np
 
 from emb_daemon.effects import paths as effects
 from emb_daemon.effects.terms import unsure_heat
+from emb_daemon.estimator.paths import pads_rise
 from emb_daemon.estimator.records import DEPTHS_M
 from emb_daemon.estimator.restart import follow_heat
 from emb_daemon.estimator.wheel import disc_speed
@@ -49,7 +50,7 @@ def _start_heat(s, t, m):
         follow_heat(s, t, m)
         _tell_temperatures(s, t)
         _begin_watch(s, m)
-        s.factor = stiffness_factor(t, 0.5 * (s.mean[0] + s.mean[1]) - t.reference, s.history)
+        s.factor = stiffness_factor(t, pads_rise(s, t), s.history)
         return
     s.disc = 0.5 * (m.inner_backplate + m.outer_backplate)
     for node in range(NODES):
@@ -59,7 +60,7 @@ def _start_heat(s, t, m):
     _widen_start(s, m, m.caliper)
     _tell_temperatures(s, t)
     _begin_watch(s, m)
-    s.history = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    s.history = pads_rise(s, t)
     s.factor = stiffness_factor(t, s.history, s.history)
 
 
@@ -134,7 +135,7 @@ def _flow(s, t, e, m):
     power = s.heat_energy / dt
     conduct(s, t, e, inner, outer, ambient, power, wheel_speed, dt, thermal.LONGEST_S)
     _tell_temperatures(s, t)
-    rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    rise = pads_rise(s, t)
     forgotten = exp(-dt / t.history_time)
     s.history = forgotten * s.history + (1.0 - forgotten) * rise
     s.factor = stiffness_factor(t, rise, s.history)

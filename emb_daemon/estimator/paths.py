@@ -74,6 +74,12 @@ def disc_warmth(s: Record) -> float:
 
 
 @njit
+def pads_rise(s: Record, t: Record) -> float:
+    """By how much (K) the pads are warmer than those of the calibration, whose heat parameters are ``t``."""
+    return 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+
+
+@njit
 def position(s: Record, p: Record, m: Record) -> float:
     """Equivalent angle past contact at this sample, rad; advances the effects that act on it."""
     e, state, before = p.effects, s.effects, s.angle + s.ahead

@@ -45,7 +45,7 @@ THERMAL = np.dtype(
         ("friction_speed", "f8", (SPEED_GRID,)),
         ("friction_temperature", "f8", (TEMPERATURE_GRID,)),
         ("friction_coefficient", "f8", (FORCE_GRID, SPEED_GRID, TEMPERATURE_GRID)),
-        *fields("f8", "softening softening_history history_time reference sigma"),
+        *fields("f8", "softening softening_history history_time softening_sigma reference sigma"),
     ],
     align=True,
 )

@@ -9,7 +9,7 @@ from math import exp
 import numpy as np
 
 from emb_daemon.effects import terms
-from emb_daemon.estimator.paths import AFTER_A_RESTART, doubt_memory, ordinary_stop
+from emb_daemon.estimator.paths import AFTER_A_RESTART, doubt_memory, ordinary_stop, pads_rise
 from emb_daemon.estimator.records import PARAMETERS, STATE
 from emb_daemon.estimator.unknown import (
     HOUSING_S,
@@ -199,6 +199,6 @@ def follow_heat(s: Record, t: Record, m: Record) -> None:
     s.temperature_sigma = min(s.temperature_sigma, _UNSEEN_K) * exp(-s.rested_s * t.disc_cooling / t.disc_heat_capacity)
     s.temperature_sigma += 0.3 * abs(before - s.disc)
     forgotten = exp(-s.rested_s / t.history_time)
-    rise = 0.5 * (s.mean[0] + s.mean[1]) - t.reference
+    rise = pads_rise(s, t)
     s.history = forgotten * s.history + (1.0 - forgotten) * rise
     s.history_sigma *= forgotten

@@ -22,6 +22,7 @@ from emb_daemon.estimator.paths import (
     doubt_friction,
     doubt_memory,
     ordinary_stop,
+    pads_rise,
     stiffness_path,
     torque_path,
 )
@@ -283,9 +284,9 @@ def _begin_warm(s, p, m):
     s.growth_start = s.disc
     set_friction(s.covariance, p, m.caliper)
     if p.clearance_sigma > 0.0:
-        rise = 0.5 * (s.mean[0] + s.mean[1]) - p.thermal.reference
+        rise = pads_rise(s, p.thermal)
         add_softening(s.covariance, p, rise, s.temperature_sigma)
-        s.softening = softening_sigma(p, s.temperature_sigma, s.history_sigma)
+        s.softening = softening_sigma(p, rise, s.temperature_sigma, s.history_sigma)
     open_all(s, p)
     keep_all(s)
 

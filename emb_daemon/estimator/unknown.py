@@ -5,7 +5,7 @@ how far it may have changed at once, between two stops or in a workshop. `estima
 was against the brake in which something has jumped.
 """
 
-from math import exp, sqrt
+from math import exp, hypot, sqrt
 
 from emb_daemon.jit import Floats, Record, njit, sq
 from emb_daemon.models.fusion import (
@@ -133,9 +133,11 @@ def set_friction(P: Floats, p: Record, caliper: float) -> None:
 
 
 @njit
-def softening_sigma(p: Record, temperature: float, history: float) -> float:
-    """Standard deviation of the stiffness, share, of pads whose temperature and its memory have these, K."""
-    return p.thermal.softening * temperature + p.thermal.softening_history * history
+def softening_sigma(p: Record, rise: float, temperature: float, history: float) -> float:
+    """Standard deviation of the stiffness, share, of pads that are ``rise`` K warmer than those of the calibration, where that
+    temperature and its memory have these, K."""
+    known = p.thermal.softening * temperature + p.thermal.softening_history * history
+    return hypot(known, p.thermal.softening_sigma * rise)
 
 
 @njit
@@ -144,7 +146,7 @@ def add_softening(P: Floats, p: Record, rise: float, sigma: float) -> None:
     the calibration, give or take ``sigma`` K. Softening was identified on hot pads; what it says of colder ones is
     extrapolated."""
     unsure = max(-rise - _MEASURED_K, 0.0) + sigma
-    P[SCALE, SCALE] += sq(softening_sigma(p, unsure, unsure))
+    P[SCALE, SCALE] += sq(softening_sigma(p, rise, unsure, unsure))
 
 
 @njit

@@ -201,7 +201,8 @@ def section(page: Page, step: StiffnessStep) -> None:
         "Output-error fit of the estimator's own stiffness path over all pads at once. Effects are tried in every combination "
         "without opposites on the first halves of the random logs, then one more element beside what is kept; kept is what "
         "lowers the error of the second halves by more than 2 % and whose amplitude stands clear of zero by three sigma. "
-        "Without random logs each slow log is predicted from the others of its pads; of a single one an effect has to explain a fifth.",
+        "Without random logs each slow log is predicted from the others of its pads; of a single one an effect has to "
+        "explain a fifth.",
     )
     _dynamics_tables(dynamics, step)
 
