@@ -173,6 +173,8 @@ def test_pads_that_yield_are_told_from_pads_that_lag():
     found = stiffness.identify(pads(truth, rng), truth.nominal())
     names = {effect.name for effect in found.chosen.effects}
     assert names == {"stiffness_hysteresis", "stress_relaxation", "slow_stress_relaxation"}
+    taken_for_slip = [c for c in found.candidates if "stress_relaxation" not in {effect.name for effect in c.effects}]
+    assert min(c.held_out_rmse for c in taken_for_slip) > 2.0 * found.chosen.held_out_rmse
     assert found.fit.rms == pytest.approx(truth.reference_noise_N, rel=0.05)
     for key, value in own.items():
         assert abs(found.values[key] - value) < 4.0 * found.sigmas[key]
