@@ -175,6 +175,32 @@ def retraction(rng, moments, size):
 
 
 @_family
+def contact_nearer(rng, moments, size):
+    """Pads that were knocked far in, or a motor that opens less far: a third to all of the clearance is gone at once."""
+    share, at = float(rng.uniform(0.3, 1.0)), pick_driving(rng, moments)
+    return Fault(f"{100 * share:.0f} % of the clearance", at, car=once(at, scale(1.0 - share, "contact_angle")))
+
+
+@_family
+def pads_drag(rng, moments, size):
+    """Pads that release no more: at once, or within a minute, the clearance is gone and up to a third of it again, so that an
+    open brake keeps some force."""
+    share, at = float(rng.uniform(1.0, 1.33)), pick_driving(rng, moments)
+    seconds = draw_size(rng, 5.0, 60.0) if rng.random() < 0.5 else 0.0
+    clearance, gone = [], [0.0]
+
+    def car(car, time_s):
+        if not clearance:
+            clearance.append(car.plants["contact_angle"].copy())
+        if time_s >= at:
+            now = share * (min((time_s - at) / seconds, 1.0) if seconds else 1.0)
+            car.plants["contact_angle"] -= (now - gone[0]) * clearance[0]
+            gone[0] = now
+
+    return Fault(f"{100 * share:.0f} % of the clearance in {seconds:.0f} s", at, car=car)
+
+
+@_family
 def jam(rng, moments, size):
     """The gear jams for a while: friction several times as large."""
     factor, at, seconds = draw_size(rng, 3.0, 20.0), pick_clamped(rng, moments), float(rng.uniform(1.0, 10.0))

@@ -5,7 +5,8 @@ from math import sqrt
 import numpy as np
 
 from emb_daemon.estimator.fuse import needed_torque, torque_change
-from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, open_again, to_torque
+from emb_daemon.estimator.hypotheses import learned_torque, likely_shift, nearer_proven, open_again, to_torque
+from emb_daemon.estimator.nearer import nearer_force, unlearn_mistaken
 from emb_daemon.estimator.paths import CYCLE_S, ONE_CYCLE_S, doubt_memory, ordinary_stop, rest, turned
 from emb_daemon.estimator.resolver import nobody_brakes
 from emb_daemon.estimator.rewind import keep_all
@@ -180,6 +181,9 @@ def watch_contact(s: Record, p: Record, m: Record, force_before: float, torque: 
     unsure = hypot(offset_sigma, learned_sigma)
     turns = s.plausibility.held < _STANDS
     found = watch_closing(c, torque, predicted, s.friction_mean, sigma, limit, x, contact_sigma, offset, unsure, turns)
+    if nearer_proven(s, p):
+        _take_nearer(s, p, m, leverage)
+        return
     # If a change explains the torque, the contact angle is not moved for the same reason.
     explained = likely_shift(s) != 0.0
     if explained:
@@ -209,6 +213,17 @@ def _believe_offset(s, offset, sigma):
     for i in range(STATES):
         s.covariance[OFFSET, i] = s.covariance[i, OFFSET] = 0.0
     s.covariance[OFFSET, OFFSET] = sigma * sigma
+
+
+@njit
+def _take_nearer(s, p, m, leverage):
+    """Believe that the contact is nearer."""
+    force, sigma = nearer_force(s.nearer)
+    unlearn_mistaken(s.nearer, s.error)
+    s.error[CONTACT] = 0.0
+    forget_level(s.contact)
+    s.contact.engaged = True
+    _start_contact(s, p, m, s.force + force, sigma, leverage)
 
 
 @njit

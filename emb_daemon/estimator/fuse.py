@@ -33,6 +33,7 @@ from emb_daemon.estimator.hypotheses import (
     weigh,
     weigh_step,
 )
+from emb_daemon.estimator.nearer import follow_nearer, place_nearer, rest_nearer
 from emb_daemon.estimator.paths import (
     CYCLE_S,
     DISSOLVING_PER_S,
@@ -112,6 +113,7 @@ from emb_daemon.models.plausibility import (
     stands,
     steady,
 )
+from emb_daemon.models.wander import STANDING_RAD_PER_S
 from emb_daemon.models.wheel import TURNING_RAD_PER_S
 
 #: Least motor torque over current times the calibration's torque constant: half of the loss that the monitor allows; and time
@@ -155,6 +157,9 @@ _BACK = 0.3
 _CLEAR = 4.0
 #: Part of a change of torque that a current which is up to half a cycle late shows in that cycle and the one before.
 _SHOWN = 0.5
+#: Cycles by which a current may be later than is known while it is being found out, and standard deviations of its noise that
+#: are no change.
+_LATER, _NOISES = 2.0, 2.0
 
 
 @njit
@@ -263,6 +268,36 @@ def _moving_variance(s, p, m):
 
 
 @njit
+def _changing(s, p, m):
+    """What the motor torque has changed by in this cycle and the one before, beyond noise, N m."""
+    changed = abs(p.torque_constant * (m.current_q - s.current_before)) if s.had_current else 0.0
+    return max(changed + abs(s.current_change) - _NOISES * p.torque_constant * s.current_sigma, 0.0)
+
+
+@njit
+def _follow_nearer(s, p, m, h, leverage, innovation, variance):
+    """Weigh a nearer contact by what the first hypothesis has just learned from."""
+    n = s.nearer
+    place_nearer(n, s.past_contact, p.curve, s.factor * s.scale)
+    if m.angle != s.angle:
+        decay, noise_decay = exp(-m.dt / p.stiffness_correlation_time), exp(-m.dt / p.current_correlation_time)
+        doubted = sq(_LATER * _changing(s, p, m))
+        follow_nearer(n, h, s.gain, leverage, innovation, variance, decay, noise_decay, doubted)
+    elif s.past_contact < -_BACK * s.clearance:
+        rest_nearer(n)
+
+
+@njit
+def _presses_open(s, p, m, torque):
+    """Whether the motor stands or stops as far open as it has been, and more than friction says that it would open on: against
+    a stop, of whose force nothing is known."""
+    stands = m.angle <= s.lowest + FLICKER_RAD and abs(m.speed) < STANDING_RAD_PER_S
+    return (
+        stands and s.past_contact < 0.0 and torque < -p.offset_friction - BEYOND_CHANCE * p.torque_constant * s.current_sigma
+    )
+
+
+@njit
 def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out):
     """Update all hypotheses, and their odds, with one torque; fills torque sigma and innovation of ``out``.
 
@@ -305,6 +340,7 @@ def _take_torque(s, p, m, torque, leverage, mean_force, friction_variance, sprea
     s.beyond_variance = max(sq(out.torque_sigma) - _AVERAGED * noise, 0.0)
     if trusted and not known:
         watch_steps(s, p, first / sqrt(variance), m.speed, m.dt)
+        _follow_nearer(s, p, m, h, leverage, first, variance)
     for kind in range(ALTERNATIVES):
         a = s.alternatives[kind]
         if not exists(a):
@@ -356,8 +392,9 @@ def fuse(
             open_all(s, p)
             s.trusted = trusted
         mean_force = 0.5 * (force_before + s.force)
+        taken = trusted and not _presses_open(s, p, m, torque)
         turning_sigma, standing_sigma = _take_torque(
-            s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, trusted, known, out
+            s, p, m, torque, leverage, mean_force, friction_variance, spread, warmth, taken, known, out
         )
         # At rest friction's error is constant: neither noise nor new information.
         if trusted and m.angle != s.angle and out.innovation_sigma < _TELLING * p.maximum_force:

@@ -13,6 +13,9 @@ friction. A jump that is opened after that starts with the wrong friction; only 
 the motor reverses. So the likeliest jump is kept in addition to its successor, until the release and while there is evidence
 for it.
 
+Beside them a contact that is nearer by more than a jump reaches (`nearer`) has its share of the mixture, and a jump of the
+torque path is not accepted for what it explains better.
+
 The last is a brake whose contact angle and stiffness differ a little from their calibration and drift. The first hypothesis
 can explain the same torque by a torque constant or a friction within their priors, so that neither is ever proven, and the
 fused force does not follow a drift. Its difference from the fused force counts in the standard deviation by its odds, and so
@@ -24,6 +27,16 @@ from math import exp, log, sqrt
 
 import numpy as np
 
+from emb_daemon.estimator.nearer import (
+    NEARER_ODDS,
+    WAYS,
+    forget_nearer,
+    nearer_force,
+    nearer_odds,
+    offset_odds,
+    set_ways,
+    way,
+)
 from emb_daemon.estimator.paths import ONE_CYCLE_S, UNCERTAIN_CONTACT_RAD, still_to_gain
 from emb_daemon.estimator.unknown import (
     LEAST_SCALE,
@@ -224,6 +237,8 @@ def exists(a: Record) -> bool:
 def _open_jumps(s, p):
     _open(s, p, STIFFNESS_JUMP)
     _open(s, p, TORQUE_JUMP)
+    forget_nearer(s.nearer)
+    set_ways(s.nearer, p, s.clearance)
 
 
 @njit
@@ -315,11 +330,39 @@ def likeliest(s: Record) -> Record:
 @njit
 def _strongest(s, but):
     """Log odds of the strongest alternative that is of another kind than ``but``."""
-    best = PRIOR_ODDS
+    best = max(PRIOR_ODDS, nearer_odds(s.nearer))
     for i in range(DRIFT):
         if s.alternatives[i].kind != but:
             best = max(best, s.alternatives[i].log_odds)
     return best
+
+
+@njit
+def _begins_nearer(s, p):
+    """Whether the torque begins where a nearer contact would be, and not, as an offset does, where the motor starts. That the
+    current jumps in that very moment is as rare as that it jumps at all."""
+    return nearer_odds(s.nearer) > offset_odds(s.nearer, p) + _CLEARLY
+
+
+@njit
+def _nearer_beyond_torque(s, p):
+    """Log odds of a nearer contact, comparable with those of a jump of the torque path."""
+    return nearer_odds(s.nearer) - (PRIOR_ODDS if _begins_nearer(s, p) else 0.0)
+
+
+@njit
+def nearer_proven(s: Record, p: Record) -> bool:
+    """Whether the contact is certainly nearer than any other change explains."""
+    if not (nearer_odds(s.nearer) > PROVEN and _begins_nearer(s, p)):
+        return False
+    proven = True
+    for i in range(DRIFT):
+        a = s.alternatives[i]
+        odds, margin = nearer_odds(s.nearer), 0.0 if a.kind == STIFFNESS_JUMP else _CLEARLY
+        if a.kind == TORQUE_JUMP:
+            odds = _nearer_beyond_torque(s, p)
+        proven = proven and odds > a.log_odds + margin
+    return proven
 
 
 @njit
@@ -348,6 +391,12 @@ def _share_out(s):
     total = 1.0
     for kind in range(DRIFT):
         total += exp(s.alternatives[kind].log_odds)
+    n = s.nearer
+    for j in range(WAYS):
+        n.share[j] = exp(NEARER_ODDS + n.odds[j] - n.lowered) / WAYS
+        total += n.share[j]
+    for j in range(WAYS):
+        n.share[j] /= total
     for kind in range(DRIFT):
         s.alternatives[kind].share = exp(s.alternatives[kind].log_odds) / total
     drifts = exp(drift_share_odds(s))
@@ -385,7 +434,7 @@ def suspected(s: Record) -> bool:
     any_speaks = False
     for kind in range(DRIFT):
         any_speaks = any_speaks or _speaks(s.alternatives[kind])
-    return any_speaks
+    return any_speaks or nearer_odds(s.nearer) > NEARER_ODDS + _SUSPECTED
 
 
 @njit
@@ -397,6 +446,11 @@ def unproven(s: Record) -> float:
         a = s.alternatives[kind]
         if _speaks(a):
             most = max(most, min(a.share, 1.0 - a.share) * abs(a.shift))
+    n, share = s.nearer, 0.0
+    for j in range(WAYS):
+        share += n.share[j]
+    if nearer_odds(n) > NEARER_ODDS + _SUSPECTED:
+        most = max(most, min(share, 1.0 - share) * nearer_force(n)[0])
     return most
 
 
@@ -530,6 +584,7 @@ def stay_finite(s: Record) -> None:
             a = s.alternatives[kind]
             if exists(a):
                 a.log_odds = max(a.log_odds - beyond, a.least)
+        s.nearer.lowered += beyond
 
 
 @njit
@@ -580,7 +635,10 @@ def settle(s: Record, p: Record, released: bool, dt: float) -> bool:
     margin = _CLEARLY if a.age_s < _AMBIGUOUS_S else 0.0
     # Expected jumps need as much evidence as others, because otherwise one false jump would lead to the next.
     evidence = a.log_odds - a.prior > PROVEN - PRIOR_ODDS
-    if released and evidence and a.log_odds > PROVEN and a.log_odds - _strongest(s, a.kind) >= margin:
+    rival = _strongest(s, a.kind)
+    if a.kind == TORQUE_JUMP:
+        rival = max(rival, _nearer_beyond_torque(s, p))
+    if released and evidence and a.log_odds > PROVEN and a.log_odds - rival >= margin:
         if a.kind == STIFFNESS_JUMP:
             s.jumps += 1.0
         _become_first(s, a)
@@ -634,6 +692,8 @@ def contact_sigma(s: Record) -> float:
         a = s.alternatives[kind]
         rest -= a.share
         square += a.share * (a.error[CONTACT] * a.error[CONTACT] + a.covariance[CONTACT, CONTACT])
+    for j in range(WAYS):
+        square += s.nearer.share[j] * sq(way(s.nearer, j))
     return sqrt(square + rest * s.covariance[CONTACT, CONTACT])
 
 
@@ -688,6 +748,11 @@ def mix(s: Record, h: Floats, spread: float, warmth: float) -> tuple[float, floa
         square += w * apart * apart
         to_force(h, s, spread, a.slope, s.force + a.shift, warmth)
         variance += w * force_variance(a.covariance, h)
+    for j in range(WAYS):
+        n = s.nearer
+        whole += n.share[j] * n.force[j]
+        mean += n.share[j] * n.force[j]
+        square += n.share[j] * (sq(n.force[j]) + sq(n.slope[j] * n.apart) / 12.0)
     d = s.alternatives[DRIFT]
     drifted = d.shift + spread * d.error[FAST] - first - mean
     to_force(h, s, spread, s.slope, s.force, warmth)

@@ -7,6 +7,7 @@ from emb_daemon.estimator.consistency import CONSISTENCY
 from emb_daemon.estimator.force_sensor import FORCE_SENSOR, FORCE_SENSOR_PARAMETERS
 from emb_daemon.estimator.hypotheses import ALTERNATIVE, ALTERNATIVES, STEPPING
 from emb_daemon.estimator.monitor import MONITOR
+from emb_daemon.estimator.nearer import NEARER
 from emb_daemon.estimator.phases import OPEN_PHASES
 from emb_daemon.estimator.resolver import AWAY
 from emb_daemon.estimator.rewind import LEARNED, STOPS
@@ -154,6 +155,7 @@ STATE = np.dtype(
         ("covariance", "f8", (STATES, STATES)),
         ("alternatives", ALTERNATIVE, (ALTERNATIVES,)),
         ("stepping", STEPPING),
+        ("nearer", NEARER),
         # What the torque says beyond the first hypothesis, N, not a number where it says nothing, and its variance but for
         # noise that a mean has not, N2; beyond the fused force, of late, and the variance of that.
         *fields("f8", "beyond beyond_variance mean_beyond beyond_square"),

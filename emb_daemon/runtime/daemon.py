@@ -20,6 +20,7 @@ from emb_daemon.calibration.files import calibration_hash
 from emb_daemon.calibration.types import Calibration, to_parameters
 from emb_daemon.errors import InputError
 from emb_daemon.estimator.fuse import fuse, take_sides
+from emb_daemon.estimator.nearer import nearer_odds
 from emb_daemon.estimator.records import ESTIMATE, STATE
 from emb_daemon.estimator.step import step
 from emb_daemon.jit import Array, compile_beside, compile_within, entry, njit
@@ -113,7 +114,7 @@ def _scan(estimates, count, states, receptions, arrivals, reported, facts):
 def _is_number(state):
     """Whether a corner's state consists of numbers. If it does not, only a restart helps. An estimate that is invalid because
     of its inputs is different: a restart would not help, and would interrupt the other corners."""
-    total = state.force + state.contact_angle + state.factor * state.scale
+    total = state.force + state.contact_angle + state.factor * state.scale + nearer_odds(state.nearer)
     for i in range(len(state.error)):
         total += state.error[i] + state.covariance[i, i]
         for k in range(len(state.alternatives)):
