@@ -33,7 +33,18 @@ from emb_daemon.estimator.hypotheses import (
     weigh,
     weigh_step,
 )
-from emb_daemon.estimator.paths import CYCLE_S, DISSOLVING_PER_S, FLICKER_RAD, ONE_CYCLE_S, SELF_LOCKING, crept, disc_warmth
+from emb_daemon.estimator.paths import (
+    CYCLE_S,
+    DISSOLVING_PER_S,
+    FLICKER_RAD,
+    ONE_CYCLE_S,
+    SELF_LOCKING,
+    count_creep,
+    crept,
+    disc_warmth,
+    follow_creep,
+    untold_creep,
+)
 from emb_daemon.estimator.phases import follow_phases, undecided, weigh_phases
 from emb_daemon.estimator.rewind import keep
 from emb_daemon.estimator.status import (
@@ -406,7 +417,10 @@ def _learn(s, p, m, trusted, known, warmth):
         open_others(s, p)
         forget(s.consistency)
         forget_level(s.contact)
+    if s.contact.engaged:
+        follow_creep(s)
     if s.stops > stops:
+        count_creep(s)
         weigh_common(s, p)
         attribute_straying(s)
         keep(s)
@@ -428,6 +442,8 @@ def _add_beside(s, p, m, out):
     if s.past_contact <= 0.0:
         # Whether pads that are apart still push with what they creep was never seen.
         out.sigma = hypot(out.sigma, crept(s, 0.0))
+    else:
+        out.sigma = hypot(out.sigma, untold_creep(s))
 
 
 @njit
