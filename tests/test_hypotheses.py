@@ -1059,6 +1059,33 @@ def test_whether_pads_that_are_apart_still_push_is_not_known(p):
     assert released["sigma"] < 100.0 and creeps["sigma"] == pytest.approx(280.0, rel=0.1)
 
 
+def test_what_creep_makes_of_a_longer_stop_than_any_before_is_not_known(p):
+    """Pads that creep look in short stops like others that are stiffer. Each stop that ends shows half of what it held beyond
+    those before; a brake that is not believed to creep has no such doubt."""
+    rows, _ = brake.samples(p, brake.clamp(p, 3.0, 1.0))
+    state = new_state()
+    plain = estimate(rows, p, state)[-1]
+    assert state["past_contact"] > 0.0
+    sigmas = []
+    for creep, shown in ((0.0, 0.0), (-0.1, 0.0), (-0.1, 5000.0), (-0.1, 10000.0)):
+        changed = state.copy()
+        changed["creep"], changed["held"], changed["held_shown"] = (0.0, creep), 10000.0, shown
+        sigmas.append(estimate(rows[-1:], p, changed)[0]["sigma"])
+    beside = np.sqrt(np.maximum(np.square(sigmas[1:]) - sigmas[3] ** 2, 0.0))
+    assert sigmas[0] == pytest.approx(plain["sigma"], rel=0.2) and beside == pytest.approx([1000.0, 500.0, 0.0], rel=0.05)
+
+
+def test_a_stop_that_ends_shows_half_of_what_it_held_the_pads_with_beyond_others(p):
+    shown = []
+    for count in (1, 2, 3):
+        state = new_state()
+        rows, _ = brake.samples(p, np.tile(brake.stops(p, 1, held_s=3.0), count))
+        estimate(rows, p, state)
+        assert state["stops"] == count and (state["held_now"] == 0.0).all()
+        shown.append(state["held_shown"][0, 0])
+    assert shown[0] > 500.0 and shown[1:] == pytest.approx([1.5 * shown[0], 1.75 * shown[0]], rel=0.05)
+
+
 def test_what_pads_creep_is_known_after_a_restart(p):
     rows, _ = brake.samples(p, brake.stops(p, 4, 1, held_s=3.0), creep=(0.06, 0.7))
     rows, state, restarted, snapshot = brake.noisy(rows, p), new_state(), new_state(), np.zeros(1, restart.SNAPSHOT)[0]

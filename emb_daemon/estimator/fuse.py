@@ -40,9 +40,12 @@ from emb_daemon.estimator.paths import (
     FLICKER_RAD,
     ONE_CYCLE_S,
     SELF_LOCKING,
+    count_creep,
     crept,
     disc_warmth,
+    follow_creep,
     pads_rise,
+    untold_creep,
 )
 from emb_daemon.estimator.phases import follow_phases, undecided, weigh_phases
 from emb_daemon.estimator.rewind import keep
@@ -453,7 +456,10 @@ def _learn(s, p, m, trusted, known, warmth):
         open_others(s, p)
         forget(s.consistency)
         forget_level(s.contact)
+    if s.contact.engaged:
+        follow_creep(s)
     if s.stops > stops:
+        count_creep(s)
         weigh_common(s, p)
         attribute_straying(s)
         keep(s)
@@ -475,6 +481,8 @@ def _add_beside(s, p, m, out):
     if s.past_contact <= 0.0:
         # Whether pads that are apart still push with what they creep was never seen.
         out.sigma = hypot(out.sigma, crept(s, 0.0))
+    else:
+        out.sigma = hypot(out.sigma, untold_creep(s))
 
 
 @njit

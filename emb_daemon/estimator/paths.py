@@ -168,6 +168,32 @@ def crept(s: Record, drive: float) -> float:
 
 
 @njit
+def follow_creep(s: Record) -> None:
+    """Take in with what force the present stop has held the pads so far."""
+    for i in range(len(_CREEP_S)):
+        s.held_now[i] = max(s.held_now[i], s.held[i])
+
+
+@njit
+def count_creep(s: Record) -> None:
+    """A stop has ended: what it held the pads with beyond earlier ones counts as shown by half, because what the torque leaves
+    open of one slow stroke it leaves open of its release, too."""
+    for i in range(len(_CREEP_S)):
+        s.held_shown[i] += 0.5 * max(s.held_now[i] - s.held_shown[i], 0.0)
+        s.held_now[i] = 0.0
+
+
+@njit
+def untold_creep(s: Record) -> float:
+    """Standard deviation (N) of what the learned creep takes from, or adds to, a force that is held for longer, or with more,
+    than any stop before: in short stops pads that creep look like others that are stiffer, and those keep their force."""
+    square = 0.0
+    for i in range(len(_CREEP_S)):
+        square += sq(s.creep[i] * max(s.held[i] - s.held_shown[i], 0.0))
+    return sqrt(square)
+
+
+@njit
 def still_to_gain(s: Record, creep: int) -> float:
     """Force (N) that pads still gain, or lose, if all of it creeps with time constant number ``creep``."""
     return s.held[creep] - s.drive

@@ -129,6 +129,8 @@ STATE = np.dtype(
         # learned.
         ("held", "f8", (len(CREEPS),)),
         ("creep", "f8", (len(CREEPS),)),
+        # Largest such force in the present stop, and that up to which earlier ones have shown what creeps, N.
+        *((name, "f8", (len(CREEPS),)) for name in ("held_now", "held_shown")),
         # Torque path. ``direction`` rad: the last way that was not nothing; ``turned_back``: share of samples of late. What
         # effects have ``gained`` of thickness, m, and by how much that ``swelled`` or shrank in this sample.
         *fields("f8", "friction_state slid_angle friction_mean friction_variance direction turned_back gained swelled"),
