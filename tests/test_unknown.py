@@ -43,7 +43,9 @@ def test_grease_thickens_e_fold_in_15_kelvin_of_cold_and_not_without_end():
 
 def test_pads_that_are_unsurely_warm_are_unsurely_soft(p):
     p["thermal"]["softening"], p["thermal"]["softening_history"] = 4e-4, 1e-3
-    assert softening_sigma(p, 10.0, 30.0) == pytest.approx(0.004 + 0.03)
+    assert softening_sigma(p, 200.0, 10.0, 30.0) == pytest.approx(0.004 + 0.03)
+    p["thermal"]["softening_sigma"] = 5e-4
+    assert softening_sigma(p, 200.0, 10.0, 30.0) == pytest.approx(np.hypot(0.004 + 0.03, 0.1))
 
 
 def _walked(p, dt, power=0.0, softening=0.0, x=None, winding=0.0):

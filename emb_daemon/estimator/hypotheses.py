@@ -429,12 +429,18 @@ def _speaks(a):
 
 
 @njit
+def _nearer_speaks(s):
+    """Whether there is evidence for a nearer contact."""
+    return nearer_odds(s.nearer) > NEARER_ODDS + _SUSPECTED
+
+
+@njit
 def suspected(s: Record) -> bool:
     """Whether an alternative is so likely that decisions wait for it."""
     any_speaks = False
     for kind in range(DRIFT):
         any_speaks = any_speaks or _speaks(s.alternatives[kind])
-    return any_speaks or nearer_odds(s.nearer) > NEARER_ODDS + _SUSPECTED
+    return any_speaks or _nearer_speaks(s)
 
 
 @njit
@@ -449,7 +455,7 @@ def unproven(s: Record) -> float:
     n, share = s.nearer, 0.0
     for j in range(WAYS):
         share += n.share[j]
-    if nearer_odds(n) > NEARER_ODDS + _SUSPECTED:
+    if _nearer_speaks(s):
         most = max(most, min(share, 1.0 - share) * nearer_force(n)[0])
     return most
 
@@ -692,8 +698,9 @@ def contact_sigma(s: Record) -> float:
         a = s.alternatives[kind]
         rest -= a.share
         square += a.share * (a.error[CONTACT] * a.error[CONTACT] + a.covariance[CONTACT, CONTACT])
-    for j in range(WAYS):
-        square += s.nearer.share[j] * sq(way(s.nearer, j))
+    if _nearer_speaks(s):
+        for j in range(WAYS):
+            square += s.nearer.share[j] * sq(way(s.nearer, j))
     return sqrt(square + rest * s.covariance[CONTACT, CONTACT])
 
 

@@ -102,12 +102,16 @@ class Scorer:
         ]
         self._contact = next(c for c in base if c.name == CLEARANCE)
         probes: list[Probe] = [Probe(c) for c in base if c is not self._contact]
+        # A score has a sign, by which the opposite of a cause is that cause.
+        opposites = {effect.name for effect in REGISTRY if effect.opposes}
         for effect in REGISTRY:
             if effect.channel not in _FORCE_CHANNELS or is_periodic(effect):
                 continue
             own = effect_coordinates(calibration, effect, _CHANNEL)
             if effect.name in calibration.effects:
                 probes += [Probe(c) for c in own.values()]
+                continue
+            if effect.name in opposites or effect.beside in opposites:
                 continue
             shapes = [((own[s.name], start),) for s in effect.shapes[:1] for start in s.starts] or [()]
             probes += [Probe(own[p.name], shape) for shape in shapes for p in effect.amplitudes]
