@@ -5,9 +5,9 @@ how far it may have changed at once, between two stops or in a workshop. `estima
 was against the brake in which something has jumped.
 """
 
-from math import exp, hypot, sqrt
+from math import exp, sqrt
 
-from emb_daemon.jit import Floats, Record, njit, sq
+from emb_daemon.jit import Floats, Record, hypot, njit, sq
 from emb_daemon.models.fusion import (
     CONTACT,
     COULOMB,
