@@ -338,6 +338,8 @@ def test_a_scan_returns_estimated_lost_and_changed_corners():
     rows["source"] = contract.INVALID
     states[1]["alternatives"]["covariance"][2, 3, 3], states[2]["error"][4] = np.nan, np.inf
     assert _scan(rows, 3, states, times, arrivals, reported, facts) == (0b1110, 0b0110, 0)
+    states[3]["nearer"]["odds"][5] = np.nan
+    assert _scan(rows, 3, states, times, arrivals, reported, facts) == (0b1110, 0b1110, 0)
 
 
 def test_a_bus_is_disturbed_for_a_second_by_lost_frames_and_error_frames_and_by_nothing_else(setup: Setup):

@@ -13,7 +13,7 @@ from diagnosekit import drives
 from emb_daemon.calibration.parameters import TORQUE_CONSTANT, moved
 from emb_daemon.diagnose import confirmation, diagnosis, grammar, search
 from emb_daemon.diagnose.comparison import episodes_by_log
-from emb_daemon.diagnose.coordinates import PAD_FRICTION, TOLERATED, tolerated
+from emb_daemon.diagnose.coordinates import PAD_FRICTION, TOLERATED, base_coordinates, tolerated
 from emb_daemon.diagnose.diagnosis import Recalibrated, diagnose
 from emb_daemon.diagnose.model import LASTING, Model, rms_known
 from emb_daemon.diagnose.page import page
@@ -82,6 +82,20 @@ def test_a_softening_that_no_log_has_shown_has_no_tolerance(calibration, value, 
     provenance = msgspec.structs.replace(calibration.provenance, sigmas={key: sigma})
     known = msgspec.structs.replace(moved(calibration, {key: value}), provenance=provenance)
     assert tolerated(known, key) == (2.0 if identified else np.inf) and tolerated(known, PAD_FRICTION) == 2.0
+
+
+@pytest.mark.parametrize(("before", "fitted", "after"), [(5e-4, 2e-5, 2e-5), (5e-4, 9e-4, 5e-4), (0.0, 2e-5, 0.0)])
+def test_a_softening_that_logs_have_shown_is_no_longer_as_unsure_as_one_that_none_has(calibration, before, fitted, after):
+    keys = [f"thermal.softening.{name}" for name in ("per_K", "sigma_per_K")]
+    found = next(c for c in base_coordinates(calibration, [0.0]) if c.name == keys[0])
+    fit = SimpleNamespace(sigmas={found: fitted})
+    selection = SimpleNamespace(applied=lambda: {found: 4e-4}, model=SimpleNamespace(fits={"stiffness": fit}))
+    known = diagnosis._with_softening_shown(moved(calibration, {keys[1]: before}), selection)
+    assert known.thermal.softening.sigma_per_K == after
+    nothing = SimpleNamespace(applied=dict)
+    assert (
+        diagnosis._with_softening_shown(moved(calibration, {keys[1]: before}), nothing).thermal.softening.sigma_per_K == before
+    )
 
 
 @pytest.mark.parametrize(

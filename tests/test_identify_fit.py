@@ -80,7 +80,8 @@ def _deviations(seed):
 @pytest.mark.parametrize("measured", [0.98, 0.7, 0.4])
 def test_a_curve_is_as_unsure_beyond_its_last_travel_as_what_it_rises_by_there(measured):
     """Coefficients whose errors cancel where the logs were: what they leave of the force at the last travel is in the errors
-    on other logs, and the rest of the way to the largest force is all that sigma has to grow by."""
+    on other logs, and the rest of the way to the largest force is all that sigma has to grow by. Without another log it is
+    nowhere else."""
     reached, rated_N = measured * 20.0, 20e3
     x = np.linspace(0.1, reached, 400)
     curve = np.array([200.0, 20.0, 1.0])
@@ -88,10 +89,15 @@ def test_a_curve_is_as_unsure_beyond_its_last_travel_as_what_it_rises_by_there(m
     fit = CurveFit(8.0, curve, seen, np.zeros(1), np.ones(1), reached)
     drawn = np.random.default_rng(1).multivariate_normal(curve, seen, 4000)
     rise = drawn @ (powers(np.array([20.0])) - powers(np.array([reached])))[0]
-    sigma = noise._extrapolation(SimpleNamespace(fit=SimpleNamespace(curves=[fit])), rated_N)
+    sigma, alone = (
+        noise._extrapolation(
+            SimpleNamespace(fit=SimpleNamespace(curves=[fit]), pads=[SimpleNamespace(logs=[None] * logs)]), rated_N
+        )
+        for logs in (2, 1)
+    )
     assert sigma == pytest.approx(np.std(rise) / rated_N, rel=0.05)
     whole = float(fit.force_sigma(np.array([20.0]))[0]) / rated_N
-    assert (sigma < 0.4 * whole) == (measured > 0.9)
+    assert (sigma < 0.4 * whole) == (measured > 0.9) and alone == pytest.approx(whole)
 
 
 def test_a_datasheet_that_is_nearly_certain_is_believed_and_a_contradiction_is_told():
@@ -173,6 +179,8 @@ def test_pads_that_yield_are_told_from_pads_that_lag():
     found = stiffness.identify(pads(truth, rng), truth.nominal())
     names = {effect.name for effect in found.chosen.effects}
     assert names == {"stiffness_hysteresis", "stress_relaxation", "slow_stress_relaxation"}
+    tried = [{effect.name for effect in c.effects} for c in found.candidates]
+    assert not any({"stress_relaxation", "second_relaxation"} <= names for names in tried)
     taken_for_slip = [c for c in found.candidates if "stress_relaxation" not in {effect.name for effect in c.effects}]
     assert min(c.held_out_rmse for c in taken_for_slip) > 2.0 * found.chosen.held_out_rmse
     assert found.fit.rms == pytest.approx(truth.reference_noise_N, rel=0.05)

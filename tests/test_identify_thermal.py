@@ -193,7 +193,16 @@ def _validated(figures, fitted_K):
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(thermal, "_validate", lambda *_: ({}, {f"validate: {key}, K": k for key, k in figures.items()}, {}))
         step = thermal.validate(campaign, step, calibration)
-    return said, moved(calibration, thermal.stated(step, calibration)).thermal.sigma_K
+    return said, moved(calibration, thermal.stated(step, calibration, {})).thermal.sigma_K
+
+
+@pytest.mark.parametrize(("per_K", "sigma", "unshown"), [(0.0, 0.0, True), (2.8e-7, 5e-4, True), (4.4e-4, 1e-5, False)])
+def test_a_softening_that_no_log_has_shown_is_stated_as_unsure(per_K, sigma, unshown):
+    """A fit of logs without heat leaves it at about nothing, which is no softening of none."""
+    calibration = moved(START, {"thermal.softening.per_K": per_K})
+    step = ThermalStep(fitted={}, heat=Step())
+    said = thermal.stated(step, calibration, {"thermal.softening.per_K": sigma})
+    assert said == ({"thermal.softening.sigma_per_K": 5e-4} if unshown else {})
 
 
 def test_sigma_of_temperatures_is_what_validation_shows_as_in_a_car():

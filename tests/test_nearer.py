@@ -53,15 +53,17 @@ def _silent_s(estimates, force, beyond_N):
     return 0.004 * max(edges[1::2] - edges[::2], default=0)
 
 
-def _driven(p, share, seed):
+def _driven(p, share, seed, pressed_A=0.0):
     """Estimates, true force, what is believed at the end, and where contact then is, of stops before which all of a sudden
-    ``share`` of the clearance is gone."""
+    ``share`` of the clearance is gone; from then on an open motor is pressed against a stop with ``pressed_A`` more."""
     path = brake.stops(p, 12, seed)
     rows, force = brake.samples(p, path)
     true, begin = p.copy(), _BEFORE * _STOP
     true["clearance"] *= 1.0 - share
     later, later_force = brake.samples(true, path)
     rows[begin:], force[begin:] = later[begin:], later_force[begin:]
+    within = np.arange(len(rows)) % _STOP
+    rows["current_q"][(np.arange(len(rows)) >= begin) & (within >= 50) & (within < 340)] += pressed_A
     state = new_state()
     return estimate(brake.noisy(rows, p, seed), p, state), force, state[0], true["clearance"]
 
@@ -83,6 +85,16 @@ def test_pads_that_drag_are_no_offset_either(p, seed):
     last = slice(-4 * _STOP, None)
     error = np.abs(estimates["force"] - force)[last]
     assert np.mean(error > 3.0 * np.hypot(estimates["sigma"][last], 25.0)) < 0.02
+
+
+@pytest.mark.parametrize("share", (1.1, 1.2))
+def test_a_motor_that_is_pressed_against_its_stop_tells_nothing_of_the_current(p, share):
+    """The stop takes what pads and current press with: taken for an offset, that is missing in the next stop."""
+    estimates, force, _, _ = _driven(p, share, 1, pressed_A=-4.0)
+    later = slice((_BEFORE + 1) * _STOP, None)
+    error, told = np.abs(estimates["force"] - force)[later], np.isin(estimates["mode"], (RUNNING, ADAPTING))[later]
+    assert np.mean(told & (error > 3.0 * np.hypot(estimates["sigma"][later], 25.0))) < 0.01
+    assert _silent_s(estimates[later], force[later], 1000.0) <= 0.1
 
 
 def _filtered(p, signal, seed=3, samples=60):

@@ -198,8 +198,12 @@ def _is_identified(calibration: Calibration, key: str) -> bool:
     """Whether a base parameter is clear of zero, by the standard deviation that its calibration states: a fit leaves about
     nothing of what its logs do not show."""
     sigmas = calibration.provenance.sigmas if calibration.provenance else {}
-    value = value_of(calibration, key)
-    return value != 0.0 and abs(value) >= _CLEAR_OF_ZERO * sigmas.get(key, 0.0)
+    return is_clear_of_zero(value_of(calibration, key), sigmas.get(key, 0.0))
+
+
+def is_clear_of_zero(value: float, sigma: float) -> bool:
+    """Whether a base parameter of this standard deviation was identified."""
+    return value != 0.0 and abs(value) >= _CLEAR_OF_ZERO * sigma
 
 
 def tolerated(calibration: Calibration, name: str) -> float:

@@ -583,9 +583,18 @@ def undecided(selection: Selection) -> dict[str, float]:
 def _with_noise(calibration: Calibration, selection: Selection) -> Calibration:
     """The calibration with new noise of its paths: less of the stiffness path where its residual was explained, and more by
     what terms as likely as the accepted ones would change (`undecided`)."""
-    calibration = _with_less_noise(calibration, selection)
+    calibration = _with_less_noise(_with_softening_shown(calibration, selection), selection)
     more = undecided(selection)
     return moved(calibration, {key: float(np.hypot(value_of(calibration, key), share)) for key, share in more.items()})
+
+
+def _with_softening_shown(calibration: Calibration, selection: Selection) -> Calibration:
+    """The calibration with what its own logs leave open of a softening that none had shown before."""
+    left_open = calibration.thermal.softening.sigma_per_K
+    for c in selection.applied():
+        if c.name == "thermal.softening.per_K":
+            left_open = min(left_open, selection.model.fits[c.channel].sigmas.get(c, np.inf))
+    return moved(calibration, {"thermal.softening.sigma_per_K": float(left_open)})
 
 
 def _with_less_noise(calibration: Calibration, selection: Selection) -> Calibration:

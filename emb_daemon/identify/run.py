@@ -79,7 +79,7 @@ def identify(campaign: Campaign, progress: Progress = lambda share, text: None) 
     levels = noise.identify(campaign, stiff, motor, folds, interpolation, found)
     calibration = tidy(moved(found.calibration, levels.values))
     heat = thermal.validate(campaign, heat, calibration)
-    unsure = thermal.stated(heat, calibration)
+    unsure = thermal.stated(heat, calibration, {**heat.sigmas, **found.sigmas})
     calibration = moved(calibration, unsure)
     validations = []
     for fold in folds:

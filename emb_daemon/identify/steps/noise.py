@@ -131,14 +131,15 @@ def _unknown_lag(stiffness: StiffnessStep, campaign: Campaign, fastest_rad_per_s
 
 def _extrapolation(stiffness: StiffnessStep, rated_N: float) -> float:
     """Relative error that curves which were not measured up to the brake's largest force have there beyond the one at their
-    last travel: that one the errors on other logs contain."""
+    last travel. That one the errors on other logs contain; of pads with a single log there are none."""
     worst = 0.0
-    for curve in stiffness.fit.curves:
+    for curve, pads in zip(stiffness.fit.curves, stiffness.pads, strict=True):
         if rising_force(curve.coefficients) < rated_N:
             return 1.0
         travel = travel_at(rated_N, curve.coefficients)
         if travel > curve.travel_rad:
-            worst = max(worst, curve.rise_sigma(curve.travel_rad, travel) / rated_N)
+            told_rad = curve.travel_rad if len(pads.logs) > 1 else 0.0
+            worst = max(worst, curve.rise_sigma(told_rad, travel) / rated_N)
     return min(worst, 1.0)
 
 

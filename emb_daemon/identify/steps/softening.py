@@ -33,7 +33,7 @@ _STEP_RAD = 0.01
 _TOGETHER = 25.0
 #: Where the calibration keeps the law and the temperature that it counts from.
 _LAW = tuple(f"thermal.softening.{name}" for name in ("per_K", "history_per_K", "history_time_s"))
-_HISTORY, _REFERENCE = _LAW[1], "thermal.softening.reference_C"
+PER_K, _HISTORY, _REFERENCE = _LAW[0], _LAW[1], "thermal.softening.reference_C"
 _POINTS = Style("#1d2430", mode="markers")
 
 

@@ -1,5 +1,6 @@
 """Heat: pads, disc, friction and softening from a rig's thermal logs, and the accuracy of temperatures."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from msgspec import structs
 from emb_daemon.calibration.parameters import keys, moved, value_of
 from emb_daemon.calibration.terms import Term
 from emb_daemon.calibration.types import Calibration, to_parameters
+from emb_daemon.diagnose.coordinates import is_clear_of_zero
 from emb_daemon.diagnose.diagnosis import with_terms
 from emb_daemon.diagnose.forms import equation
 from emb_daemon.diagnose.grammar import search_heat
@@ -22,7 +24,7 @@ from emb_daemon.identify.steps import Step, cooling, friction, softening
 from emb_daemon.identify.steps.cooling import CoolingLaw, cooling_law
 from emb_daemon.identify.steps.friction import FrictionFit, fit_friction
 from emb_daemon.identify.steps.heat import check_excitation, fit_heat
-from emb_daemon.identify.steps.softening import SofteningFit, fit_softening
+from emb_daemon.identify.steps.softening import PER_K, SofteningFit, fit_softening
 from emb_daemon.identify.text import rounded, with_sigma
 from emb_daemon.offline import Log, estimate
 from emb_daemon.offline.recording import Recording, recording, simulate
@@ -31,7 +33,7 @@ from emb_daemon.report.figures import MODEL, PALE, Panel, Style, Trace, shades, 
 from emb_daemon.report.page import Page
 
 #: Loss of stiffness per kelvin that pads may have which no log has shown hot, one standard deviation: those of the simulated
-#: rigs A and H, which follow the thesis's law (8.4), lose 4.4e-4 at once, and as much again within half an hour.
+#: rigs A and H, which follow the thesis's law (8.4), lose 4.4e-4 at once, and 6e-4 to 7e-4 more in half an hour.
 _UNSHOWN_SOFTENING_PER_K = 5e-4
 #: Pads are not known better than their thermocouples, K.
 _LEAST_SIGMA_K = 0.3
@@ -199,14 +201,14 @@ def validate(campaign: Campaign, step: ThermalStep, calibration: Calibration) ->
     return replace(step, temperatures=temperatures, figures=figures, **found)
 
 
-def stated(step: ThermalStep, calibration: Calibration) -> dict[str, float]:
+def stated(step: ThermalStep, calibration: Calibration, sigmas: Mapping[str, float]) -> dict[str, float]:
     """Standard deviations of what logs leave open: of the pads' temperatures, where validation as in a car shows more than the
     calibration states, because logs that fitted tell least of what the heat does elsewhere; and of a softening that none
-    has shown."""
+    has shown. ``sigmas`` of what was identified, by key."""
     unsure = {}
     if step.in_car_K > calibration.thermal.sigma_K:
         unsure["thermal.sigma_K"] = rounded(step.in_car_K, 4)
-    if not calibration.thermal.softening.per_K:
+    if not is_clear_of_zero(calibration.thermal.softening.per_K, sigmas.get(PER_K, 0.0)):
         unsure["thermal.softening.sigma_per_K"] = _UNSHOWN_SOFTENING_PER_K
     return unsure
 
